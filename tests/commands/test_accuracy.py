@@ -75,7 +75,7 @@ class TestSizes:
     @pytest.mark.parametrize("size", [0, -3, 65])
     def test_refused(self, config, size):
         for options in (((size,),), ((), size)):
-            with pytest.raises(ConfigError, match=f"size {size}: "):
+            with pytest.raises(ConfigError, match=f"size = {size}: "):
                 accuracy.check(config, *options)
 
     def test_too_few_pixels_to_reconstruct(self, config):

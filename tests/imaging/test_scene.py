@@ -212,3 +212,25 @@ def test_impossible_scenes():
         Scene([], 500 * nm)
     with pytest.raises(ValueError, match=r"different batch shapes \[\(\), \(2,\)\]"):
         Scene([one, batch], 500 * nm)
+
+
+def test_a_filter_multiplies_the_shares():
+    light = Spectrum([480 * nm, 520 * nm, 560 * nm, 700 * nm], [1.0, 2.0, 1.0, 1.0])
+    green = light.filtered([500 * nm, 540 * nm, 600 * nm], [0.2, 1.0, 0.4])
+    np.testing.assert_allclose(green.weights, [0.0, 1.2, 0.8, 0.0], rtol=1e-6)
+    np.testing.assert_array_equal(green.wavelengths, light.wavelengths)
+
+
+@pytest.mark.parametrize(
+    ("places", "curve", "message"),
+    [
+        ([500 * nm], [1.0], "two lists of one length, of two or more"),
+        ([500 * nm, 600 * nm], [1.0], "two lists of one length"),
+        ([600 * nm, 500 * nm], [1.0, 1.0], "ascending order"),
+        ([500 * nm, 600 * nm], [1.0, -1.0], "negative share"),
+    ],
+)
+def test_wrong_filters(places, curve, message):
+    light = Spectrum([520 * nm, 590 * nm])
+    with pytest.raises(ValueError, match=message):
+        light.filtered(places, curve)

@@ -10,7 +10,7 @@ from helpers import relative_l2
 from thincam_jax.imaging.operators import adjoint_error, kernel_grid
 from thincam_jax.lensless.field import tangents_of
 from thincam_jax.lensless.forward import imaging_operator
-from thincam_jax.lensless.propagation.obliquity import fall_of_light
+from thincam_jax.lensless.light import fall_of_light
 from thincam_jax.lensless.psf import psf_about_ray
 from thincam_jax.units import nm, um
 
@@ -110,17 +110,6 @@ def test_cells_by_samples_at_infinity_and_two_colours(centre):
     h = np.asarray(h)[49 - 10 :, 65 - 50 :][: SENSOR[0], : SENSOR[1]]
     exact = PITCH**2 * h * (1 + seen[0] ** 2 + seen[1] ** 2) ** -2
     assert relative_l2(np.asarray(fit.operator(point(10, 50))), exact) < 0.03
-
-
-def test_the_light_falls_as_the_fourth_power_of_the_cosine():
-    """A sum over a Lambertian plane's patches: solid angle of a pixel times its projection."""
-    rows, columns = tangents_of(CAMERA, FIELD)
-    y, x = rows[3], columns[60]
-    to_the_point = np.array([y, x, 1.0]) * 250.0
-    length = np.linalg.norm(to_the_point)
-    cosine = 250.0 / length
-    expected = (cosine / length**2 * cosine) * 250.0**2
-    assert fall_of_light(rows, columns)[3, 60] == pytest.approx(expected, rel=1e-12)
 
 
 def test_too_wide_a_field_says_what_to_do():

@@ -3,6 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
+from thincam_jax._core import checks
 from thincam_jax._core.environment import machine
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
@@ -29,15 +30,6 @@ def sizes_of_psfs(asked: tuple[int, ...], sensor: SensorConfig) -> tuple[int, ..
     return tuple(sorted(set(asked or (*(s for s in _SIZES if s < own), own))))
 
 
-def _check(option: str, size: int, own: int) -> None:
-    if size < 1:
-        raise ConfigError(f"{option} {size}: give a number of pixels above zero")
-    if size > own:
-        raise ConfigError(
-            f"{option} {size}: the study's own sensor has {own} pixels; give at most {own}"
-        )
-
-
 def check(
     config: StudyConfig, sizes: tuple[int, ...] = (), capture_size: int | None = None
 ) -> AccuracyRun:
@@ -53,9 +45,12 @@ def check(
         )
     own = max(config.sensor.shape)
     of_captures = min(_CAPTURE_SIZE, own) if capture_size is None else capture_size
-    for size in sizes:
-        _check("--size", size, own)
-    _check("--capture-size", of_captures, own)
+    try:
+        for size in sizes:
+            checks.whole("--size", size, 1, own)
+        checks.whole("--capture-size", of_captures, 1, own)
+    except ValueError as error:
+        raise ConfigError(f"{error}, the pixels of the study's own sensor") from None
     study = build_study(config)
     case = make_case(study, of_captures)
     try:
@@ -97,9 +92,6 @@ def _record(plan: AccuracyRun) -> dict[str, Any]:
 
 
 def _numbers(exposure: Exposure) -> dict[str, Any]:
-    return {
-        "beta_rad_per_mm2": exposure.beta,
-        "phase_rad": exposure.phase,
-        "distance_mm": exposure.distance,
-        "wavelength_mm": exposure.wavelength,
-    }
+    names = "beta_rad_per_mm2", "phase_rad", "distance_mm", "wavelength_mm"
+    numbers = exposure.beta, exposure.phase, exposure.distance, exposure.wavelength
+    return dict(zip(names, numbers, strict=True))

@@ -155,6 +155,24 @@ class Spectrum(Module):
         if not checks.is_traced(self.weights) and (np.asarray(self.weights) < 0).any():
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
+    def filtered(self, wavelengths: Numbers, transmission: Numbers) -> "Spectrum":
+        """This light behind a colour filter, such as one of a sensor's three: shares × transmission.
+
+        - `wavelengths`: of the filter's curve, mm, ascending.
+        - `transmission`: at these, ≥ 0; linear between them, 0 beyond.
+        """
+        places = checks.wavelengths("wavelengths", checks.array("wavelengths", wavelengths))
+        curve = checks.array("transmission", transmission)
+        if places.ndim != 1 or curve.shape != places.shape or places.size < 2:
+            raise ValueError(
+                f"wavelengths and transmission have shapes {places.shape} and {curve.shape}; give "
+                "two lists of one length, of two or more"
+            )
+        if not checks.is_traced(places) and (np.diff(np.asarray(places)) <= 0).any():
+            raise ValueError("wavelengths do not rise; give the filter's curve in ascending order")
+        passed = jnp.interp(self.wavelengths, places, curve, left=0.0, right=0.0)
+        return Spectrum(self.wavelengths, self.weights * passed.astype(self.weights.dtype))
+
 
 class Scene(Module):
     """Image planes at distances, all with one spectrum. Planes do not hide each other.

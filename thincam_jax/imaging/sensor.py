@@ -6,6 +6,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
@@ -16,6 +17,27 @@ from thincam_jax._core.random import random_key
 
 Pictures = Float[Array, "*batch y x"]
 Electrons = Float[Array, "*batch 1 1"]  # per unit of each picture
+
+
+def _response(name: str, given: Any) -> Float[Array, "*table"]:
+    """The check of an angular response: a power, or a table of angles and responses."""
+    response = checks.array(name, given)
+    if response.ndim == 0:
+        return checks.non_negative(name, given, "a power of cos θ")
+    if response.ndim != 2 or response.shape[-1] != 2 or len(response) < 2:
+        raise ValueError(
+            f"{name} has shape {response.shape}; give one number, n of cosⁿθ, or a table of two "
+            "rows or more, (angle in rad, response)"
+        )
+    if checks.is_traced(response):
+        return response
+    angles, values = np.asarray(response).T
+    if angles[0] != 0 or (np.diff(angles) <= 0).any() or not values.min() >= 0:
+        raise ValueError(
+            f"{name} is no table of responses >= 0 at angles that rise from 0; give rows of "
+            "(angle in rad, response)"
+        )
+    return response
 
 
 class Sensor(Module):
@@ -29,6 +51,9 @@ class Sensor(Module):
     - `electrons`: in place of `exposure`, an exposure time that is the same for every image: so
       many electrons of a pixel from each mm² of open aperture, the unit of captures, before a
       white scene.
+    - `angular_response`: of the pixels, beside the cosine of their tilted area: n of cosⁿθ, or a
+      table of rows (θ in rad, response) from θ = 0 on. It counts where captures have the light of
+      every point of the field (`PsfMethod(field_tolerance=1)`, plans).
     - `bit_depth`: bits of the analogue-digital converter, whose range is the full well; None does
       not quantise. Needs an `exposure` or `electrons`.
 
@@ -60,6 +85,9 @@ class Sensor(Module):
     )
     bit_depth: int | None = eqx.field(
         default=None, converter=whole(1, 24, optional=True), static=True, kw_only=True
+    )
+    angular_response: Float[Array, "*table"] | None = eqx.field(
+        default=None, converter=quantity(check=_response, optional=True), kw_only=True
     )
 
     def __check_init__(self):

@@ -2,6 +2,7 @@
 
 import functools
 import operator
+import warnings
 from typing import Any
 
 from jaxtyping import Array, Float
@@ -11,9 +12,14 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
-from thincam_jax.lensless.method import Model, PsfMethod
+from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
 from thincam_jax.lensless.plan import Plan, run_plan
 from thincam_jax.lensless.sampling import warn_if_unresolved
+
+_ON_AXIS = (
+    "the sensor's angular_response is left out: every point has the light of the axis; give "
+    "model=PsfMethod(field_tolerance=1)"
+)
 
 
 @checked
@@ -66,6 +72,8 @@ def capture(
         image = run_plan(model, camera, scene)
     else:
         average = pixel_integration is not False
+        if camera.sensor.angular_response is not None and as_method(model).field_tolerance is None:
+            warnings.warn(_ON_AXIS, AccuracyWarning, stacklevel=3)
         parts = (
             expose(camera, plane, scene.spectrum, model=model, pixel_integration=average)
             for plane in scene.planes

@@ -22,13 +22,10 @@ from thincam_jax.imaging.operators import (
 )
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.light import light_over_field
 from thincam_jax.lensless.masks.base import zone_orders
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
-from thincam_jax.lensless.propagation.obliquity import (
-    ERROR_PER_RADIAN,
-    fall_of_light,
-    shift_variance,
-)
+from thincam_jax.lensless.propagation.obliquity import ERROR_PER_RADIAN, shift_variance
 from thincam_jax.lensless.psf import spectral_psf
 
 # Points of the field along each axis: odd, so that the axis is one of them.
@@ -51,7 +48,7 @@ def field_operator(
     of the axis and the fewest convolutions for its changes, :math:`h(\mathbf x; \mathbf u) =
     \sum_r w_r(\mathbf u) p_r(\mathbf x - \mathbf u)` (`LowRank`). The points are Chebyshev's, and
     polynomials through them give the weights of every point of the field. A map of the light,
-    cos⁴θ, multiplies the weights (`fall_of_light`).
+    cos⁴θ and the pixels' angular response, multiplies the weights (`light_over_field`).
 
     **Arguments**
 
@@ -103,7 +100,7 @@ def field_fit(
     assert method.field_tolerance is not None
     tolerance, tangents = method.field_tolerance, tangents_of(camera, field_shape)
     sensor, grid = camera.sensor, kernel_grid(camera.sensor.grid, field_shape)
-    fall = fall_of_light(*tangents)
+    fall = light_over_field(sensor, *tangents)
     if tolerance >= 1:
         own = spectral_psf(camera, colours, object_distance, method, grid)
         axis = CropConvolution(own[None], sensor.pitch, sensor.shape, field_shape, summed=1)

@@ -19,7 +19,7 @@ from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import line_pair, usaf1951_elements
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.field import tangents_of
-from thincam_jax.lensless.propagation.obliquity import fall_of_light
+from thincam_jax.lensless.light import light_over_field
 from thincam_jax.reconstruction import (
     AdmmTV,
     Cameras,
@@ -143,7 +143,7 @@ def reconstructor(
     def even(captures: Array, variances: Array) -> Reconstruction:
         found = solve(captures, variances)
         rows, columns = found.image.shape[-2:]
-        fall = fall_of_light(*tangents_of(camera, (rows, columns)))
+        fall = light_over_field(study.sensor, *tangents_of(camera, (rows, columns)))
         return replace(found, image=found.image / fall.astype(found.image.dtype))
 
     return even

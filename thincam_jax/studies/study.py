@@ -313,6 +313,8 @@ class Study:
         """What the PSF of the axis leaves out at the corner of the widest target."""
         if self.field_tolerance is not None or not self.targets:
             return []
+        if self.sensor.angular_response is not None:
+            return ["angular_response counts with a field_tolerance only, such as 0.01"]
         slope = max(math.hypot(t.plane.height, t.width) / 2 / t.distance for t in self.targets)
         angle, change = math.atan(slope), 0.0
         for exposure in self.exposures:

@@ -8,8 +8,9 @@ import numpy as np
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import probe_of
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.light import light_over_field
 from thincam_jax.lensless.method import has_few_terms
-from thincam_jax.lensless.propagation.obliquity import fall_of_light, psf_change
+from thincam_jax.lensless.propagation.obliquity import psf_change
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def effects_of(
     always = _shot_noise(camera, tolerance), _fresnel(camera, scene, tolerance)
     if over_field:
         return always
-    return _shift_variance(camera, scene, tolerance), _obliquity(scene, tolerance), *always
+    return _shift_variance(camera, scene, tolerance), _obliquity(camera, scene, tolerance), *always
 
 
 def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect:
@@ -52,7 +53,7 @@ def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> E
     return Effect("shift-variance", False, size, f"{what}: about {size:.1e}, {verdict}")
 
 
-def _obliquity(scene: Scene, tolerance: float) -> Effect:
+def _obliquity(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect:
     """Fall of light towards the edge of the field, averaged over the planes."""
     falls = []
     for plane in scene.planes:
@@ -60,9 +61,9 @@ def _obliquity(scene: Scene, tolerance: float) -> Effect:
             np.linspace(-0.5, 0.5, 33) * float(n) / float(plane.distance)
             for n in (plane.height, plane.width)
         )
-        falls.append(np.mean((1 - fall_of_light(y, x)) ** 2))
+        falls.append(np.mean((1 - np.asarray(light_over_field(camera.sensor, y, x))) ** 2))
     size = math.sqrt(float(np.mean(falls)))
-    return Effect("obliquity", False, size, _left_out(size, tolerance, "fall of light, cos⁴θ"))
+    return Effect("obliquity", False, size, _left_out(size, tolerance, "fall of light over the field"))
 
 
 def _left_out(size: float, tolerance: float, what: str) -> str:

@@ -2,7 +2,7 @@ r"""What a scene requires of the field: the PSF and the light of the axis, or th
 
 What the axis leaves out is a change of the transfer function that grows with the angle,
 :math:`H(\mathbf k; \mathbf u) - H(\mathbf k) \approx \sum_i u_i^2 A_i(\mathbf k) + u_i^4
-B_i(\mathbf k)` along the two axes i, and the fall of light w = cos⁴θ. The captured error of a scene
+B_i(\mathbf k)` along the two axes i, and the fall of light w (`light_over_field`). The captured error of a scene
 f is then that of a few weighted scenes: with F their spectra, :math:`\sum_i A_i F[u_i^2 w f] + B_i
 F[u_i^4 w f] + H\,(F[wf] - F[f])`.
 """
@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Complex
 
 from thincam_jax.lensless.field import points_needed, tangents_of
+from thincam_jax.lensless.light import light_over_field
 from thincam_jax.lensless.masks.base import zone_orders
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
 from thincam_jax.lensless.plan.transfer import TransferProbe, image_spectrum
-from thincam_jax.lensless.propagation.obliquity import fall_of_light
 from thincam_jax.lensless.propagation.skew import PIXEL_POINTS
 
 # Parts of the field's half width where the change is looked at.
@@ -77,7 +77,7 @@ def _changes(seen: SeenScene, wavelength: float, distance: float) -> Complex[np.
 def _errors(seen: SeenScene, changes: list[Complex[np.ndarray, "2 2 k"]]) -> tuple[float, float]:
     """Of the capture with the PSF and the light of the axis, and with its PSF alone."""
     tangents = tangents_of(seen.camera, seen.field_shape)
-    lit = seen.total * fall_of_light(*tangents)
+    lit = seen.total * np.asarray(light_over_field(seen.camera.sensor, *tangents))
     dimmed = image_spectrum(lit - seen.total, seen.frequencies)
     edges = zip((tangents[0][:, None], tangents[1]), seen.edges, strict=True)
     parts = [t / edge for t, edge in edges]

@@ -1,4 +1,4 @@
-"""Light off the axis: what the models of the PSF hold of it, how it changes, how it falls."""
+"""Light off the axis: what the models of the PSF hold of it, and how it changes."""
 
 import math
 import warnings
@@ -76,17 +76,3 @@ def psf_change(wavelength: float, distance: float, frequency: float, cosine: flo
     """
     phase = shift_variance(wavelength, distance, frequency, cosine)
     return 2 * ERROR_PER_RADIAN * math.sin(min(phase, math.pi) / 2)
-
-
-def fall_of_light(
-    down: Float[np.ndarray, " m"], across: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "m n"]:
-    r"""cos⁴θ at the tangents of two angles: the light of a plane of equal radiance on the sensor.
-
-    A patch dA of the plane sends :math:`L\,dA\cos\theta` per solid angle towards the mask, over
-    the way :math:`t/\cos\theta` onto pixels tilted by θ: :math:`L\,dA\cos^4\theta/t^2`. The same
-    holds for a scene at infinity, where the solid angle of a step of the tangents is
-    :math:`\cos^3\theta`. A display or a lamp that is brighter along its normal falls faster;
-    multiply the scene with the rest.
-    """
-    return (1 + down[:, None] ** 2 + across**2) ** -2
