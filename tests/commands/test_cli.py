@@ -203,7 +203,9 @@ class TestBenchAccuracy:
     def test_size(self, file, tmp_path, option, size):
         out = tmp_path / "out"
         line = one_line(call("bench", "accuracy", file, "--out", out, option, size))
-        assert line.startswith(f"{option} = {size}: give a whole number from 1 to 64, the pixels of")
+        assert line.startswith(
+            f"{option} = {size}: give a whole number from 1 to 64, the pixels of"
+        )
         assert not out.exists()
 
     def test_folder_of_somebody_else(self, file, tmp_path):

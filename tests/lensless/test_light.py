@@ -64,11 +64,11 @@ def test_captures_and_their_operators_have_the_response():
 
 def test_a_capture_of_the_axis_says_that_it_has_no_response():
     scene = tc.Scene(tc.ImagePlane(np.ones((4, 6)), 250.0, 40.0), 500 * nm)
-    with pytest.warns(AccuracyWarning, match="model=PsfMethod.field_tolerance=1"):
+    with pytest.warns(AccuracyWarning, match="model=PsfMethod.field_tolerance=1.0"):
         tc.capture(camera(angular_response=1.0), scene)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = tc.PsfMethod(field_tolerance=1)
+        model = tc.PsfMethod(field_tolerance=1.0)
         tc.capture(camera(angular_response=1.0), scene, model=model)
 
 

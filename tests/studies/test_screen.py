@@ -7,7 +7,8 @@ from studies import tiny_screen
 
 import thincam_jax as tc
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.studies.screen import PublishedImage, ScreenModel, mistaken_rays, summarise_rays
+from thincam_jax.studies.pictures import PublishedImage
+from thincam_jax.studies.screen import ScreenModel, mistaken_rays, summarise_rays
 from thincam_jax.units import nm
 
 SINGLE = (ScreenModel("right"), ScreenModel("single", "no_ghosts"))

@@ -185,10 +185,16 @@ class PictureConfig(TargetConfig):
 
     - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where it
       is below its mean, else white.
+    - `width`: of the picture, and `x`, `y` of its middle, y downwards, in parts of the width of the
+      cells, which are black beside it; `rotation`: clockwise.
     """
 
     crop: Annotated[float, Field(gt=0, le=1)] = 1.0
     binary: bool = False
+    width: Annotated[float, Field(gt=0, le=1)] = 1.0
+    x: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    y: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    rotation: Angle = 0.0
 
 
 class ExperimentConfig(Section):

@@ -156,7 +156,7 @@ class Spectrum(Module):
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
     def filtered(self, wavelengths: Numbers, transmission: Numbers) -> "Spectrum":
-        """This light behind a colour filter, such as one of a sensor's three: shares × transmission.
+        """This light behind a colour filter, such as one of a sensor's three.
 
         - `wavelengths`: of the filter's curve, mm, ascending.
         - `transmission`: at these, ≥ 0; linear between them, 0 beyond.

@@ -18,7 +18,7 @@ from thincam_jax.lensless.sampling import warn_if_unresolved
 
 _ON_AXIS = (
     "the sensor's angular_response is left out: every point has the light of the axis; give "
-    "model=PsfMethod(field_tolerance=1)"
+    "model=PsfMethod(field_tolerance=1.0)"
 )
 
 

@@ -44,12 +44,7 @@ def fall_of_light(
 
 @checked
 def shading(
-    down: Numbers,
-    across: Numbers,
-    *,
-    depth: Number,
-    opening: Number,
-    width: Number | None = None,
+    down: Numbers, across: Numbers, *, depth: Number, opening: Number, width: Number | None = None
 ) -> Float[np.ndarray, "m n"]:
     r"""Part of a square opening that is lit past an edge before it: of walls and of baffles.
 

@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
 from thincam_jax.plot.frame import drawing, line_style
-from thincam_jax.studies.screen import Reconstructed, ScreenResult, ScreenStudy
+from thincam_jax.studies.pictures import Reconstructed
+from thincam_jax.studies.screen import ScreenResult, ScreenStudy
 from thincam_jax.studies.screen_calibration import CalibrationResult
 from thincam_jax.units import nm
 
@@ -121,14 +123,27 @@ def draw_images(result: ScreenResult, figure: Figure | None = None) -> Figure:
     colours = [in_colour(capture, light) for capture in captures]
     columns = [("capture, turned", colours, [""] * len(colours))]
     columns += [(name, list(one.images), _labels(one)) for name, one in first[1].methods.items()]
-    return _sheet(study, columns, figure)
+    return _sheet(study.targets, columns, figure)
 
 
 def draw_models(result: ScreenResult) -> Figure:
     """Targets, and what every model reconstructs by the last solver."""
     last = list(result.study.solvers)[-1]
     found = {name: model.methods[last] for name, model in result.models.items()}
-    return _sheet(result.study, [(n, list(one.images), _labels(one)) for n, one in found.items()])
+    columns = [(name, list(one.images), _labels(one)) for name, one in found.items()]
+    return _sheet(result.study.targets, columns)
+
+
+def draw_pictures(
+    targets: Mapping[str, np.ndarray],
+    captures: Float[np.ndarray, "picture y x"],
+    found: Mapping[str, Reconstructed],
+) -> Figure:
+    """Pictures shown, their captures in grey, turned upright, and reconstructions by solver."""
+    bright = np.quantile(captures, 0.999)
+    columns = [("capture, turned", list(captures[:, ::-1, ::-1] / bright), [""] * len(captures))]
+    columns += [(name, list(one.images), _labels(one)) for name, one in found.items()]
+    return _sheet(targets, columns)
 
 
 def _labels(found: Reconstructed) -> list[str]:
@@ -140,15 +155,15 @@ def _decibels(score: float | None) -> str:
 
 
 def _sheet(
-    study: ScreenStudy,
+    targets: Mapping[str, np.ndarray],
     columns: Sequence[tuple[str, list[np.ndarray], list[str]]],
     figure: Figure | None = None,
 ) -> Figure:
     """A row for each target; columns of a title, images and their labels beside it."""
-    size = (1.75 * (len(columns) + 1), 1.95 * len(study.targets))
-    shape = len(study.targets), len(columns) + 1
+    size = (1.75 * (len(columns) + 1), 1.95 * len(targets))
+    shape = len(targets), len(columns) + 1
     drawn, rows = drawing(size, *shape, figure=figure, squeeze=False)
-    for number, ((target, truth), axes) in enumerate(zip(study.targets.items(), rows, strict=True)):
+    for number, ((target, truth), axes) in enumerate(zip(targets.items(), rows, strict=True)):
         _panel(axes[0], truth, target, "" if number else "target")
         for ax, (title, images, labels) in zip(axes[1:], columns, strict=True):
             _panel(ax, images[number], labels[number], "" if number else title)

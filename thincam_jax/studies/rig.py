@@ -7,9 +7,10 @@ agree within the noise, the rig's geometry, electronics and bookkeeping are righ
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,9 +22,10 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix, Sparse
 from thincam_jax.measured import calibration
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction import AbstractSolver, Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
 from thincam_jax.studies.evaluate import reconstructor, rounded, sample
+from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
 from thincam_jax.studies.screen_calibration import diagonal_cells
 from thincam_jax.studies.simulate import noise_free
 from thincam_jax.studies.study import Study
@@ -235,6 +237,56 @@ def recover_to(
     seconds = round(time.perf_counter() - began, 2)
     whole = pixel_count, captures.series.cell_count
     return MeasuredMatrix(whole, cells, stacks, agreement, seconds)
+
+
+def calibrated(path: Path, folder: Path) -> tuple[Any, ReducedMatrix]:
+    """The matrix of a calibration, unread, and its reduction.
+
+    - `path`: matrix.zarr beside its reduced.npz, as `recover_to` writes them; or the store of its
+      Hadamard captures, whose matrix goes into the folder.
+
+    **Errors**: CaptureStoreError, ValueError or OSError, one line, for what is neither.
+    """
+    if not path.with_name("reduced.npz").is_file():
+        recover_to(folder, calibration.open_captures(path))
+        path = folder / "matrix.zarr"
+    matrix = calibration.open_matrix(path)
+    return matrix, ReducedMatrix.load(path.with_name("reduced.npz"), matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class ShownPictures:
+    """Pictures on a monitor, by name, and what was captured and reconstructed of them.
+
+    - `captures`: mean frames without the dark one, counts. `methods`: by solver.
+    """
+
+    targets: dict[str, Float[np.ndarray, "row column"]]
+    captures: Float[np.ndarray, "picture y x"]
+    methods: dict[str, Reconstructed]
+
+
+def reconstruct_pictures(
+    targets: dict[str, Float[np.ndarray, "row column"]],
+    frames: Float[np.ndarray, "frame y x"],
+    known: tuple[Any, ReducedMatrix],
+    solvers: Mapping[str, AbstractSolver],
+) -> ShownPictures:
+    """Pictures from frames, equally many of each in the order of `targets`, by a calibration.
+
+    - `known`: see `calibrated`. The noise is estimated from the frames.
+
+    **Errors**: ValueError where the matrix is of other cells or pixels than the frames.
+    """
+    matrix, reduced = known
+    shape = next(iter(targets.values())).shape
+    if reduced.in_shape != shape:
+        raise ValueError(f"the matrix is of {reduced.in_shape} cells; the pictures have {shape}")
+    captures = frames.reshape(len(targets), -1, *frames.shape[1:]).mean(axis=1)
+    variance = estimate_noise(jnp.asarray(captures[:, None], jnp.float32)) ** 2
+    seen = ScreenCaptures(reduced.project(matrix, captures), variance[:, 0])
+    found = {n: reconstructed(targets, solver, reduced, seen) for n, solver in solvers.items()}
+    return ShownPictures(targets, captures, found)
 
 
 def _exact_matrix(

@@ -6,7 +6,6 @@ capture is a sum of ghosts, whose shifts and weights differ from pixel to pixel 
 """
 
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,17 +15,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.quantity import check_fields, choice, quantity
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
-from thincam_jax.imaging.metrics import psnr, ssim
-from thincam_jax.imaging.operators import AbstractOperator, Sparse
+from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.sensor import AbstractNoise, electrons_per_unit, read_out
-from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Recording, reconstruct
-from thincam_jax.studies.evaluate import rounded
+from thincam_jax.reconstruction import AbstractSolver
+from thincam_jax.studies.pictures import (
+    PublishedImage,
+    Reconstructed,
+    ScreenCaptures,
+    beside,
+    reconstructed,
+)
 from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.hologram import directions
 from thincam_jax.waveguide.rays import bragg_rays
@@ -70,13 +74,6 @@ class ScreenModel:
         if self.glass_thickness is None:
             return words
         return f"{words}, with a glass of {self.glass_thickness:g} mm"
-
-
-class ScreenCaptures(eqx.Module):
-    """Captures (target, *channel, y, x), or reduced ones, and the variance of their noise."""
-
-    images: Array
-    variance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,55 +275,12 @@ def _bounce(guided: Array, index: Array) -> Array:
     return guided / jnp.sqrt(jnp.maximum(left, 1e-6))[..., None]
 
 
-def reconstruct_targets(
-    system: AbstractOperator, solver: AbstractSolver, captures: ScreenCaptures
-) -> Reconstruction:
-    """All targets at once, (target, *channel, y, x)."""
-    variance = captures.variance[None]
-    return reconstruct(Recording(captures.images[None], [system], noise_variance=variance), solver)
-
-
-@dataclass(frozen=True)
-class TargetScores:
-    """Agreement of a reconstruction with its target; the PSNR of an exact one is None."""
-
-    psnr_db: float | None
-    ssim: float
-
-
-@dataclass(frozen=True)
-class MethodScores:
-    """Figures of merit of a solver with a model; `targets` by name. The time has compilation."""
-
-    mean_psnr_db: float | None
-    seconds_per_image: float
-    status: str
-    iterations: int
-    targets: dict[str, TargetScores]
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstructed:
-    """The targets as a solver reconstructs them with a model, and their scores."""
-
-    images: Float[np.ndarray, "target y x *channel"]
-    scores: MethodScores
-
-
 @dataclass(frozen=True, eq=False)
 class ModelResult:
     """What a model gives: its mistake in words, and the reconstructions by name of the solver."""
 
     mistake: str
     methods: dict[str, Reconstructed]
-
-
-@dataclass(frozen=True)
-class PublishedImage:
-    """Figures that a publication gives for a target and a solver; None where it gives none."""
-
-    psnr_db: float | None = None
-    seconds: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,25 +320,8 @@ class ScreenResult:
         return Table(headings, rows, (1,) * (len(targets) + 2), words=(len(targets) + 3,))
 
     def published_table(self, published: Mapping[str, Mapping[str, PublishedImage]]) -> Table:
-        """Every target with the right model, beside what was published of it.
-
-        - `published`: by target and solver; either may be missing.
-        """
-        methods = {name: one.scores for name, one in self.right.methods.items()}
-        rows = []
-        for target in self.study.targets:
-            own = [scores.targets[target] for scores in methods.values()]
-            stated = [published.get(target, {}).get(name, PublishedImage()) for name in methods]
-            others = (number for one in stated for number in (one.psnr_db, one.seconds))
-            rows.append((target, *(n for one in own for n in (one.psnr_db, one.ssim)), *others))
-        seconds = (t for s in methods.values() for t in (f"{s.seconds_per_image:.2f}", ""))
-        rows.append(("time for an image, s", *seconds, *[""] * (2 * len(methods))))
-        ours = (heading for name in methods for heading in (f"{name}\nPSNR dB", "SSIM"))
-        theirs = (h for name in methods for h in (f"published\n{name}, dB", "published\ns"))
-        count = 2 * len(methods)
-        digits = (*(1, 3) * len(methods), *(1,) * count)
-        columns = range(count + 1, 2 * count + 1)
-        return Table(("target", *ours, *theirs), rows, digits, published=columns)
+        """Every target with the right model, beside what was published of it (`beside`)."""
+        return beside(self.right.methods, published)
 
     def plot(self) -> "Figure":
         """Targets, captures, and what the right model reconstructs by every solver."""
@@ -414,27 +351,9 @@ class ScreenRun:
 
     def _reconstruct(self, number: int, name: str) -> None:
         study = self.study
-        found = reconstructed(study, study.solvers[name], study.systems[number], study.captures)
+        system, captures = study.systems[number], study.captures
+        found = reconstructed(study.targets, study.solvers[name], system, captures)
         self.models[study.models[number].name].methods[name] = found
-
-
-def reconstructed(
-    study: ScreenStudy, solver: AbstractSolver, system: AbstractOperator, captures: ScreenCaptures
-) -> Reconstructed:
-    """Reconstruct the targets of a study from captures by a matrix, and score them."""
-    began = time.perf_counter()
-    found = reconstruct_targets(system, solver, captures)
-    images = np.asarray(found.image, float)
-    images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
-    seconds = time.perf_counter() - began
-    pairs = list(zip(images, study.targets.values(), strict=True))
-    scores = [psnr(image, truth) for image, truth in pairs]
-    of_targets = {
-        name: TargetScores(rounded(score), round(ssim(image, truth), 4))
-        for name, score, (image, truth) in zip(study.targets, scores, pairs, strict=True)
-    }
-    means = rounded(float(np.mean(scores))), round(seconds / len(images), 3)
-    return Reconstructed(images, MethodScores(*means, found.status, found.iterations, of_targets))
 
 
 @dataclass(frozen=True)

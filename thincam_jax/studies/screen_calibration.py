@@ -31,15 +31,13 @@ from thincam_jax.measured import calibration as measuring
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, Order
 from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
 from thincam_jax.studies.evaluate import rounded
-from thincam_jax.studies.screen import (
-    GLASS,
+from thincam_jax.studies.pictures import (
     Reconstructed,
     ScreenCaptures,
-    ScreenStudy,
     reconstruct_targets,
     reconstructed,
-    with_glass,
 )
+from thincam_jax.studies.screen import GLASS, ScreenStudy, with_glass
 
 MEASURED = "measured matrix"
 _SHOWN = 3  # cells whose columns of the matrix are compared with the exact ones
@@ -309,8 +307,8 @@ class CalibrationRun:
 
     def _reconstruct(self, name: str) -> None:
         study, known = self.study, self.measured
-        captures = known.reduce(study.captures)
-        self.methods[name] = reconstructed(study, study.solvers[name], known.reduced, captures)
+        captures, solver = known.reduce(study.captures), study.solvers[name]
+        self.methods[name] = reconstructed(study.targets, solver, known.reduced, captures)
 
     def _fit(self) -> None:
         """The screen from the matrix, which is let go of: another of its size may be measured."""

@@ -232,11 +232,11 @@ def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, t
     assert [step.position for step in command.build_plan(config).steps] == positions
 
 
-@pytest.mark.parametrize("name", ["rig_virtual", "rig_hadamard"])
+@pytest.mark.parametrize("name", ["rig_virtual", "rig_hadamard", "rig_pictures"])
 def test_shipped_files(name):
     config = load_as(CaptureConfig, ROOT / "configs" / f"{name}.yaml")
     plan = command.build_plan(config)
-    assert len(plan.steps) == {"rig_virtual": 5, "rig_hadamard": 1032}[name]
+    assert len(plan.steps) == {"rig_virtual": 5, "rig_hadamard": 1032, "rig_pictures": 8}[name]
 
 
 PLUG_IN = recipe("a device")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, zone_plate
-from thincam_jax.hardware.displays.patterns import hadamard_frame, mask_pattern, pattern_levels
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, pictures, zone_plate
+from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 PITCH = 0.036  # mm, the modulator of the thesis
@@ -81,14 +82,14 @@ def test_masks_that_do_not_fit(mask, pitch, message):
         mask_pattern(mask, SHAPE, pitch)
 
 
-def test_hadamard_frames_are_those_of_the_series():
+def test_cells_are_the_largest_that_fit():
     series = HadamardSeries(object_shape=(2, 8), dark_frames=1)
     for number in range(series.frame_count):
         expected = np.zeros(SHAPE)
         expected[7:17] = np.kron(255 * series.frame(number), np.ones((5, 5)))
-        np.testing.assert_array_equal(hadamard_frame(series, number, SHAPE), expected)
+        np.testing.assert_array_equal(on_cells(255 * series.frame(number), SHAPE), expected)
     with pytest.raises(ValueError, match="do not fit into 24 × 40"):
-        hadamard_frame(HadamardSeries(object_shape=(32, 32)), 0, SHAPE)
+        on_cells(np.zeros((32, 32), np.uint8), SHAPE)
 
 
 def test_levels_of_the_patterns_of_a_plan():
@@ -98,7 +99,20 @@ def test_levels_of_the_patterns_of_a_plan():
     numbers = {"rows": 4, "columns": 8, "order": "natural", "display": "complementary", "frame": 5}
     series = HadamardSeries((4, 8), order="natural", display="complementary")
     frame = pattern_levels(Pattern("hadamard", numbers), SHAPE, PITCH)
-    assert np.array_equal(frame, hadamard_frame(series, 5, SHAPE))
+    assert np.array_equal(frame, on_cells(255 * series.frame(5), SHAPE))
     assert not pattern_levels(BLACK, SHAPE, PITCH).any()
     with pytest.raises(ValueError, match="kind 'own' has no levels"):
         pattern_levels(Pattern("own"), SHAPE, PITCH)
+
+
+def test_a_picture_is_the_one_of_the_plan():
+    picture = np.random.default_rng(0).integers(0, 256, (4, 8), np.uint8)
+    plan = pictures({"own": picture}, CameraSettings(exposure=0.01), frames=2, dark_frames=1)
+    assert [plan.pattern(step).kind for step in plan.steps] == ["black", "picture", "picture"]
+    shown = plan.pattern(plan.steps[1])
+    levels = pattern_levels(shown, SHAPE, PITCH, {"own": picture})
+    np.testing.assert_array_equal(levels[2:22], np.kron(picture, np.ones((5, 5))))
+    assert not levels[:2].any() and not levels[22:].any()
+    for other in ({}, {"own": picture ^ 1}, {"own": picture.reshape(8, 4)}):
+        with pytest.raises(ValueError, match="the picture 'own' is not the one of the plan"):
+            pattern_levels(shown, SHAPE, PITCH, other)

@@ -140,29 +140,23 @@ def known_drivers() -> list[str]:
 
 def build_plan(config: "CaptureConfig") -> "Plan":
     """The plan of a file, with its settings."""
-    from thincam_jax.hardware.acquisition import plan as plans
     from thincam_jax.hardware.base import CameraSettings
 
-    asked, camera, optics = config.plan, config.camera, config.optics
-    settings = camera.build(CameraSettings)
-    if asked.kind == "hadamard":
-        return plans.hadamard(asked.series, settings)
-    assert optics is not None and asked.width is not None  # of lensless plans
-    mask = plans.zone_plate(asked.betas[0], asked.width, phase=asked.phase, profile=asked.profile)
-
-    dark = {"dark_frames": asked.dark_frames}
-    zero = {"stage_zero": optics.distance, **dark}
-    if asked.kind == "method_a":
-        plan = plans.method_a(mask, asked.distances, settings, **zero)
-    elif asked.kind == "psf_stack":
-        plan = plans.psf_stack(mask, asked.distances, settings, **zero)
-    elif asked.kind == "method_b":
-        plan = plans.method_b(mask, asked.betas, settings, **dark)
-    else:
-        plan = plans.fringe_scan(mask, settings, **dark)
+    settings = config.camera.build(CameraSettings)
+    zero = 0.0 if config.optics is None else config.optics.distance
+    plan = config.plan.build().plan(settings, stage_zero=zero, shown=_levels(config))
     if config.stage is not None:  # it stands where the optics are known
         plan = plan.at_position(0.0)
     return plan
+
+
+def _levels(config: "CaptureConfig") -> dict[str, Any]:
+    """Of the pictures of a plan on its cells, uint8, by name."""
+    if config.plan.kind != "pictures":
+        return {}
+    from thincam_jax.commands.capture.run import pictures
+
+    return {name: (255 * one).round().astype("uint8") for name, one in pictures(config).items()}
 
 
 @contextlib.contextmanager
@@ -174,27 +168,27 @@ def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
     from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.hardware.acquisition.rig import open_rig
 
-    pitch, virtual = config.display.pitch, None
+    pitch, virtual, pictures = config.display.pitch, None, _levels(config)
     if config.rig == "virtual":
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
         try:
-            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual))
+            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual, pictures))
         except (ValueError, TypeError) as error:
             raise ConfigError(f"options: {error}") from None
-        _shown(plan.patterns[0], rig.display.shape, pitch)
+        _shown(plan.patterns[0], rig.display.shape, pitch, pictures)
         yield rig
 
 
-def _shown(pattern: "Pattern", shape: tuple[int, int], pitch: float) -> Any:
+def _shown(pattern: "Pattern", shape: tuple[int, int], pitch: float, pictures: Any) -> Any:
     """Levels (y, x) on a display. **Errors**: ConfigError for a pattern that it cannot show."""
     from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.hardware.displays.patterns import pattern_levels
 
     try:
-        return pattern_levels(pattern, shape, pitch)
+        return pattern_levels(pattern, shape, pitch, pictures)
     except ValueError as error:
-        key = "cells" if pattern.kind == "hadamard" else "width"
+        key = "width" if pattern.kind == "fza" else "cells"
         raise ConfigError(f"plan.{key}: {error}") from None
 
 
@@ -250,6 +244,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     else:
         frames = found.captures()
     patterns, virtual = found.patterns[: len(frames)], config.virtual
+    pictures = _levels(config)
     darks = sum(step.dark for step in found.plan.steps)
     if config.rig == "virtual" and virtual is not None:
         electron, offset = virtual.build(Electronics).scale(found.settings[0])
@@ -260,7 +255,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     return Taken(
         frames,
         [pattern.label for pattern in patterns],
-        [_shown(pattern, display, config.display.pitch) for pattern in patterns],
+        [_shown(pattern, display, config.display.pitch, pictures) for pattern in patterns],
         found.pixels,
         json.loads(read_regular(seconds)) if seconds.is_file() else {},
         simulated,

@@ -6,23 +6,27 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import Curvature, Length, Section, Time, Wavelength, section
-from thincam_jax.commands.screen.config import SeeThroughConfig, check_cells
+from thincam_jax.commands.schema import Length, Section, Time, Wavelength, section
+from thincam_jax.commands.screen.config import (
+    ScreenMethodConfig,
+    ScreenTargetConfig,
+    SeeThroughConfig,
+)
 from thincam_jax.commands.sections import (
     ExperimentConfig,
     MethodKind,
     Name,
     ObjectConfig,
-    TargetConfig,
     VariationConfig,
+    check_names,
 )
+from thincam_jax.hardware.acquisition.request import MONITOR, PlanRequest
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model
-from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 Count = Annotated[int, Field(ge=1, le=65536)]
 
@@ -51,66 +55,8 @@ class DisplayConfig(
     settle: Time
 
 
-PlanKind = Literal["fringe_scan", "method_a", "method_b", "psf_stack", "hadamard"]
-# What each kind needs, and what it may have beside the dark frames.
-_ZONES = ("betas", "width")
-_NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "fringe_scan": (_ZONES, ("profile",)),
-    "method_a": ((*_ZONES, "distances"), ("profile",)),
-    "method_b": (_ZONES, ("profile",)),
-    "psf_stack": ((*_ZONES, "distances"), ("profile", "phase")),
-    "hadamard": (("cells",), ("order", "display")),
-}
-
-
-_PATTERNS, _SHOWN = ("order", "display", "dark_frames"), ("width", "profile", "phase")
-_Plate = section(FresnelZoneAperture, only=_SHOWN, defaults={"width": None})
-
-
-class PlanConfig(section(HadamardSeries, only=_PATTERNS), _Plate):
-    """What is captured.
-
-    - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
-      `profile`, `phase`: of all of them.
-    - `distances`: mask-sensor distances (method_a) or those of
-      what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
-    - `cells`, `order`, `display`: of the Hadamard patterns.
-    - `dark_frames`: in all; they are spread over the plan.
-    """
-
-    kind: PlanKind
-    betas: tuple[Curvature, ...] = ()
-    distances: tuple[Length, ...] = ()
-    cells: tuple[Count, Count] | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _fits(self):
-        # A resolved file names the defaults, too.
-        fields = {key: field.default for key, field in type(self).model_fields.items()}
-        given = {key for key, usual in fields.items() if getattr(self, key) != usual}
-        given -= {"kind", "dark_frames"}
-        needed, also = _NUMBERS[self.kind]
-        allowed = (*needed, *also)
-        for key in needed:
-            if not getattr(self, key):
-                raise FieldError(f"a plan of kind {self.kind} needs it", key)
-        for key in sorted(given.difference(allowed)):
-            raise FieldError(f"a plan of kind {self.kind} takes {', '.join(allowed)}; drop it", key)
-        if self.kind == "method_b" and len(self.betas) < 2:
-            raise FieldError("method_b compares two β or more; give another", "betas")
-        if self.kind not in ("method_b", "hadamard") and len(self.betas) != 1:
-            raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
-        if len(set(self.betas)) < len(self.betas) or len(set(self.distances)) < len(self.distances):
-            raise FieldError("an entry stands twice; give each once", "betas")
-        if self.cells is not None:
-            check_cells(self.cells, "cells")
-        return self
-
-    @property
-    def series(self) -> HadamardSeries:
-        """Of a plan of kind hadamard."""
-        assert self.cells is not None  # checked above
-        return self.build(HadamardSeries, object_shape=self.cells)
+class PlanConfig(section(PlanRequest)):
+    """`thincam_jax.hardware.acquisition.PlanRequest`."""
 
 
 class AcquisitionConfig(
@@ -157,7 +103,10 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
 class CaptureConfig(ExperimentConfig):
     """What a rig captures, `rig: real`, or one that is simulated, `rig: virtual`.
 
-    - `targets`: what stands at the object's distance of a virtual rig, one.
+    - `targets`: what stands at the object's distance of a virtual rig, one; or the pictures of a
+      plan of kind pictures, on its cells.
+    - `matrix`: with which such pictures are reconstructed: matrix.zarr of a calibration's run, or
+      the store of its captures; by `methods`.
     """
 
     kind: Literal["capture"]
@@ -170,7 +119,9 @@ class CaptureConfig(ExperimentConfig):
     optics: OpticsConfig | None = None
     reconstruction: ReconstructionConfig = ReconstructionConfig()
     virtual: VirtualConfig | None = None
-    targets: Annotated[tuple[TargetConfig, ...], Field(max_length=1)] = ()
+    targets: tuple[ScreenTargetConfig, ...] = ()
+    matrix: str | None = None
+    methods: tuple[ScreenMethodConfig, ...] = ()
     notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
@@ -178,9 +129,20 @@ class CaptureConfig(ExperimentConfig):
         kind = self.plan.kind
         if kind in ("method_a", "psf_stack") and self.stage is None:
             raise FieldError(f"a plan of kind {kind} moves a stage; give one", "stage")
-        if (kind == "hadamard") == (self.optics is not None):
-            verb = "takes no" if kind == "hadamard" else "needs"
+        if (kind in MONITOR) == (self.optics is not None):
+            verb = "takes no" if kind in MONITOR else "needs"
             raise FieldError(f"a plan of kind {kind} {verb} optics", "optics")
+        check_names(self, "methods", "targets")
+        if (kind == "pictures") != (self.matrix is not None):
+            verb = "needs it" if kind == "pictures" else "takes none; drop it"
+            raise FieldError(f"a plan of kind {kind} {verb}", "matrix")
+        if kind == "pictures":
+            for key in ("targets", "methods"):
+                if not getattr(self, key):
+                    raise FieldError("a plan of kind pictures needs them; give one", key)
+        elif self.methods or len(self.targets) > 1:
+            key = "methods" if self.methods else "targets"
+            raise FieldError(f"a plan of kind {kind} has one picture and 'reconstruction'", key)
         if self.rig == "virtual":
             self._check_virtual()
         return self
@@ -195,16 +157,16 @@ class CaptureConfig(ExperimentConfig):
         plan, virtual = self.plan, self.virtual
         if virtual is None:
             raise FieldError("rig: virtual needs this section", "virtual")
-        if plan.kind != "hadamard":
+        if plan.kind not in MONITOR:
             if not self.targets:
                 raise FieldError("a virtual rig looks at one; give it", "targets")
             return
         seen = virtual.screen
         if seen is None:
-            message = "a virtual rig for a plan of kind hadamard needs it"
+            message = f"a virtual rig for a plan of kind {plan.kind} needs it"
             raise FieldError(message, "virtual", "screen")
         if seen.hologram.colours is not None:
-            message = "a plan of kind hadamard takes one colour; give wavelength in their place"
+            message = f"a plan of kind {plan.kind} takes one colour; give wavelength instead"
             raise FieldError(message, "virtual", "screen", "hologram", "colours")
         if seen.object.cells != plan.cells:
             message = f"the plan shows {plan.cells}; give these"

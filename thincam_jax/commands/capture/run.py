@@ -3,34 +3,39 @@
 import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from thincam_jax._core.table import Table
 from thincam_jax.commands.capture.config import CaptureConfig
-from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen.run import build_cameras, build_plane
+from thincam_jax.commands.screen.run import PUBLISHED, build_cameras, build_plane, published_figures
+from thincam_jax.commands.screen.run import build_solver as build_solver_of
 from thincam_jax.commands.sections import PHASES, SensorConfig, TargetConfig, build_solver
-from thincam_jax.commands.study.build import build_optics, read_target
+from thincam_jax.commands.study.build import build_optics, picture, read_target
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import calibration
 from thincam_jax.plot import rig as plot
-from thincam_jax.plot.screen import draw_columns
+from thincam_jax.plot.screen import draw_columns, draw_pictures
+from thincam_jax.studies.pictures import beside
 from thincam_jax.studies.rig import (
     CountingCamera,
     FrameAgreement,
     MatrixAgreement,
     Pixels,
     RigFrames,
+    calibrated,
     compare_frames,
     frame_solver,
     monitor_system,
+    reconstruct_pictures,
     recover_to,
 )
 from thincam_jax.studies.study import Method, Study, Synthesis, Target
@@ -82,6 +87,7 @@ class _CaptureRun(Run):
         super().__init__(config, folder)
         self.taken, self.lit = taken, _lit(config, taken.frames.shape[1:])
         self.agreement: FrameAgreement | MatrixAgreement | None = None
+        self.table: Table | None = None  # of pictures
         self.metrics |= {
             "study": config.name,
             "kind": config.kind,
@@ -92,6 +98,8 @@ class _CaptureRun(Run):
         self.add("captures", self.show)
         if config.plan.kind == "hadamard":
             self.add("system matrix", self.recover)
+        elif config.plan.kind == "pictures":
+            self.add("images", self.look)
         elif config.plan.kind != "psf_stack":
             self.add("image", self.reconstruct)
         self.add("report", self.report)
@@ -99,7 +107,7 @@ class _CaptureRun(Run):
     def report(self) -> None:
         if self.agreement is not None:
             self.metrics["agreement"] = asdict(self.agreement)
-        self.complete(page(self.config, self.taken, self.agreement))
+        self.complete(page(self.config, self.taken, self.agreement, self.table))
 
     def show(self) -> None:
         taken, config, folder = self.taken, self.config, self.folder
@@ -128,6 +136,24 @@ class _CaptureRun(Run):
             self.folder.save_image(name.replace(" ", "-"), image)
         self.metrics["status"] = captured.status
         self.metrics["object_pixel_mm"] = float(np.asarray(captured.pitch))
+
+    def look(self) -> None:
+        """The pictures, by the matrix of a calibration."""
+        config, taken = self.config, self.taken
+        try:
+            known = calibrated(Path(config.matrix or ""), self.folder.path)
+            solvers = {method.name: build_solver_of(method) for method in config.methods}
+            found = reconstruct_pictures(pictures(config), taken.frames, known, solvers)
+        except ValueError as error:
+            raise ConfigError(f"{config.place_of('matrix')}matrix: {error}") from None
+        self.folder.save_figure(
+            "images", draw_pictures(found.targets, found.captures, found.methods)
+        )
+        for name, one in found.methods.items():
+            for target, image in zip(found.targets, one.images, strict=True):
+                self.folder.save_image(f"{slug(target)}--{slug(name)}", image)
+        self.metrics["methods"] = {name: asdict(one.scores) for name, one in found.methods.items()}
+        self.table = beside(found.methods, published_figures(config.targets))
 
     def recover(self) -> None:
         """The matrix into a store, and what it is reduced to; compared where it is known."""
@@ -196,6 +222,17 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     )
 
 
+def pictures(config: CaptureConfig) -> dict[str, np.ndarray]:
+    """Of a plan of pictures, radiance 0 to 1 on its cells, by name.
+
+    **Errors**: ConfigError for pictures that cannot be read.
+    """
+    cells = config.plan.cells or (0, 0)
+    found = config.read_all("targets", lambda one: picture(one, cells), "path")
+    levels = [np.rint(255 * one).astype(np.uint8) for one in found]
+    return {one.name: level / 255 for one, level in zip(config.targets, levels, strict=True)}
+
+
 def screen_system(config: CaptureConfig) -> Sparse:
     """From the cells of a virtual rig to its sensor: 1 where a white monitor is brightest."""
     assert config.virtual is not None and config.virtual.screen is not None
@@ -209,7 +246,10 @@ def screen_system(config: CaptureConfig) -> Sparse:
 
 
 def page(
-    config: CaptureConfig, taken: Taken, agreement: FrameAgreement | MatrixAgreement | None
+    config: CaptureConfig,
+    taken: Taken,
+    agreement: FrameAgreement | MatrixAgreement | None,
+    table: Table | None = None,
 ) -> Page:
     """The page of a finished run."""
     beside = ", beside that of a direct simulation with other noise, and without"
@@ -239,6 +279,7 @@ def page(
     )
     compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
     parts = [compared] if rows else []
+    parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
     parts += [Part("Time", (time,))] if taken.seconds else []
     parts += [Part("Notes", config.notes)] if config.notes else []
     return Page(lead, parts)

@@ -21,6 +21,7 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 from thincam_jax.reconstruction import Ridge
+from thincam_jax.studies.pictures import PublishedImage
 from thincam_jax.studies.refocus import SceneObject
 from thincam_jax.studies.screen import ScreenModel
 from thincam_jax.studies.screen_calibration import MEASURED, Calibration
@@ -116,11 +117,8 @@ class ModelConfig(section(ScreenModel, without=("name",))):
     name: Name
 
 
-class MeasuredConfig(Section):
+class PublishedConfig(section(PublishedImage)):
     """What a publication reports of a target."""
-
-    psnr_db: float
-    seconds: Annotated[float, Field(gt=0)]
 
 
 class ScreenTargetConfig(PictureConfig):
@@ -129,7 +127,7 @@ class ScreenTargetConfig(PictureConfig):
     - `published`: by the method's name.
     """
 
-    published: dict[str, MeasuredConfig] = {}
+    published: dict[str, PublishedConfig] = {}
 
 
 class CalibrationConfig(section(Calibration)):

@@ -2,6 +2,7 @@
 
 import resource
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -15,6 +16,7 @@ from thincam_jax.commands.screen.config import (
     CalibrationConfig,
     ScreenConfig,
     ScreenMethodConfig,
+    ScreenTargetConfig,
     SeeThroughConfig,
 )
 from thincam_jax.commands.sections import VariationConfig
@@ -23,7 +25,6 @@ from thincam_jax.plot import screen as plot
 from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
 from thincam_jax.studies.screen import (
     ModelResult,
-    PublishedImage,
     RaySummary,
     ScreenResult,
     ScreenRun,
@@ -40,7 +41,7 @@ _FIELD = (
     "Each pixel is reached by one colour, and its ghosts have a shift of their own: no convolution "
     "describes this camera."
 )
-_PUBLISHED = (
+PUBLISHED = (
     "Ours are simulated, the published ones measured: the differences are those of the two, not of "
     "the methods. Times are with compilation, all images together."
 )
@@ -186,6 +187,14 @@ def _scores(model: ModelResult) -> dict[str, Any]:
     return {"mistake": model.mistake, "methods": methods}
 
 
+def published_figures(targets: Sequence[ScreenTargetConfig]) -> dict[str, dict[str, Any]]:
+    """Of each target, by method."""
+    return {
+        target.name: {method: one.build() for method, one in target.published.items()}
+        for target in targets
+    }
+
+
 def page(
     config: ScreenConfig,
     result: ScreenResult,
@@ -195,13 +204,7 @@ def page(
 ) -> Page:
     """The page of a finished run; `peak`: the most memory it took, GB."""
     right, last = config.models[0].name, config.methods[-1].name
-    published = {
-        target.name: {
-            method: PublishedImage(one.psnr_db, one.seconds)
-            for method, one in target.published.items()
-        }
-        for target in config.targets
-    }
+    published = published_figures(config.targets)
     images = (
         "Targets, what the sensor captures (in the colours of its pixels, turned upright), and "
         f"reconstructions with the model “{right}”."
@@ -225,7 +228,7 @@ def page(
     if calibration is not None and config.calibration is not None:
         calibrated = _calibration(config, config.calibration, calibration)
     parts = (
-        Part("Beside the thesis' Table 5.1", (result.published_table(published), _PUBLISHED)),
+        Part("Beside the thesis' Table 5.1", (result.published_table(published), PUBLISHED)),
         Part("What an error of the model costs", errors, "Errors of the model"),
         Part("Calibration with Hadamard patterns", calibrated, "Calibration"),
         Part("Notes", config.notes),

@@ -123,6 +123,7 @@ def picture(target: PictureConfig, cells: tuple[int, int], channels: int = 0) ->
         picture = np.broadcast_to(picture, (*cells, channels))
     if target.binary:
         picture = (picture > picture.mean()).astype(float)
+    picture = drawn.placed(picture, target.width, (target.y, target.x), target.rotation)
     if picture.min() == picture.max():
         raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
     return picture

@@ -3,7 +3,8 @@
 A plan holds a table of patterns, one of camera settings, and the steps, which point into both. Its
 SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with its own plan. The
 ready-made plans are those of the thesis: fringe scanning, method A (several mask-sensor distances),
-method B (pairs of phases of several β), a stack of PSFs by depth, and Hadamard calibration.
+method B (pairs of phases of several β), a stack of PSFs by depth, Hadamard calibration, and
+pictures on the calibrated cells.
 """
 
 import dataclasses
@@ -14,6 +15,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from thincam_jax._core.quantity import check_fields
 from thincam_jax.hardware.base import CameraSettings, Region
@@ -31,6 +34,7 @@ class Pattern:
 
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
+    - "picture": `name` and SHA-256 `digest` of its levels on `rows` × `columns` cells.
     - "black": no numbers. Other kinds are the renderer's own.
     """
 
@@ -42,6 +46,8 @@ class Pattern:
         """In a figure's title: β and φ of a mask, the number of a Hadamard frame."""
         if self.kind == "fza":
             return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f}"
+        if self.kind == "picture":
+            return str(self.numbers["name"])
         return f"pattern {self.numbers['frame']}" if self.kind == "hadamard" else self.kind
 
 
@@ -238,6 +244,31 @@ def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
     black = Step(len(plan.patterns) - 1, dark=True)
     facts = {"series": {**described, "object_shape": [rows, columns]}}
     return dataclasses.replace(plan, steps=plan.steps + (black,) * lacking, facts=facts)
+
+
+def pictures(
+    shown: Mapping[str, np.ndarray],
+    settings: CameraSettings,
+    *,
+    frames: int = 1,
+    dark_frames: int = 0,
+) -> Plan:
+    """Pictures on the cells of a monitor, `frames` captures of each.
+
+    - `shown`: levels of the cells (row, column), uint8, by name. The plan has a digest of each: a
+      changed picture makes another plan.
+    """
+    shots = []
+    for name, levels in shown.items():
+        numbers = {"rows": levels.shape[0], "columns": levels.shape[1]}
+        named = {"name": name, "digest": picture_digest(levels)}
+        shots += [(Pattern("picture", {**named, **numbers}), None)] * frames
+    return _plan("pictures", shots, settings, dark_frames)
+
+
+def picture_digest(levels: np.ndarray) -> str:
+    """SHA-256 of levels (row, column), uint8, and of their shape."""
+    return hashlib.sha256(repr(levels.shape).encode() + levels.tobytes()).hexdigest()
 
 
 def _changed(mask: Pattern, **numbers: float) -> Pattern:

@@ -73,12 +73,14 @@ def open_rig(
     drivers: Mapping[Role, tuple[str, Mapping[str, Any]]],
     pitch: float,
     virtual: "VirtualRig | None" = None,
+    pictures: Mapping[str, np.ndarray] | None = None,
 ) -> Iterator[Rig]:
     """Open the devices of a rig and home its stage; a context manager.
 
     - `drivers`: name and options of the driver of the camera, the display and, if any, the stage.
     - `pitch`: of the display's pixels, mm, for which zone plates are drawn.
     - `virtual`: simulated optics, whose virtual devices are opened in place of real ones.
+    - `pictures`: those of a plan of pictures, by name.
 
     **Errors**: those of the drivers; ValueError for unknown options.
     """
@@ -94,7 +96,7 @@ def open_rig(
             openers = {role: partial(getattr(devices, role), *drivers[role]) for role in drivers}
 
         def render(pattern: Pattern) -> np.ndarray:
-            return pattern_levels(pattern, rig.display.shape, pitch)
+            return pattern_levels(pattern, rig.display.shape, pitch, pictures)
 
         rig = Rig(openers["camera"], openers["display"], render, openers.get("stage"))
         stack.enter_context(rig)

@@ -1,14 +1,15 @@
-"""Patterns for a display, uint8 of its shape: those of a plan, masks and Hadamard frames.
+"""Patterns for a display, uint8 of its shape: those of a plan, masks and cells.
 
 Levels are proportional to the transmitted irradiance, as with the display's table of grey levels.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.hardware.acquisition.plan import Pattern
+from thincam_jax.hardware.acquisition.plan import Pattern, picture_digest
 from thincam_jax.lensless.masks import FresnelZoneAperture
 from thincam_jax.lensless.masks.cells import AbstractCellMask
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
@@ -16,17 +17,30 @@ from thincam_jax.measured.calibration.hadamard import HadamardSeries
 _HARMONICS = 99  # of a profile's series; the rest is less than a level
 
 
-def pattern_levels(pattern: Pattern, shape: tuple[int, int], pitch: float) -> np.ndarray:
+def pattern_levels(
+    pattern: Pattern,
+    shape: tuple[int, int],
+    pitch: float,
+    pictures: Mapping[str, np.ndarray] | None = None,
+) -> np.ndarray:
     """Levels of a pattern of a plan on a display of a shape and a pixel pitch, mm.
 
-    **Errors**: as of `mask_pattern` and `hadamard_frame`; ValueError for a pattern of another kind.
+    - `pictures`: by name, levels of cells (row, column), as the plan was made with.
+
+    **Errors**: as of `mask_pattern` and `on_cells`; ValueError for a pattern of another kind, and a
+    picture that is not the one of the plan.
     """
     numbers: dict[str, Any] = dict(pattern.numbers)
+    if pattern.kind == "picture":
+        levels = (pictures or {}).get(numbers["name"])
+        if levels is None or picture_digest(levels) != numbers["digest"]:
+            raise ValueError(f"the picture {numbers['name']!r} is not the one of the plan")
+        return on_cells(levels, shape)
     if pattern.kind == "black":
         return np.zeros(shape, np.uint8)
     if pattern.kind == "hadamard":
         cells, frame = (numbers.pop("rows"), numbers.pop("columns")), numbers.pop("frame")
-        return hadamard_frame(HadamardSeries(cells, **numbers), frame, shape)
+        return on_cells(255 * HadamardSeries(cells, **numbers).frame(frame), shape)
     if pattern.kind != "fza":
         raise ValueError(f"a pattern of kind {pattern.kind!r} has no levels; give an own `render`")
     return mask_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
@@ -82,20 +96,19 @@ def mask_pattern(
     return np.rint(255 * np.clip(amplitude, 0.0, 1.0) ** 2).astype(np.uint8)
 
 
-def hadamard_frame(series: HadamardSeries, number: int, shape: tuple[int, int]) -> np.ndarray:
-    """Frame `number` of a series, centred on the display, with the largest cells that fit.
+def on_cells(levels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Levels of cells (row, column), centred on the display, with the largest cells that fit.
 
     **Errors**: ValueError where a cell would be smaller than a pixel.
     """
-    cells = series.frame(number)
-    size = min(shape[axis] // cells.shape[axis] for axis in (0, 1))
+    size = min(shape[axis] // levels.shape[axis] for axis in (0, 1))
     if size < 1:
         raise ValueError(
-            f"{cells.shape[0]} × {cells.shape[1]} cells do not fit into {shape[0]} × {shape[1]} "
+            f"{levels.shape[0]} × {levels.shape[1]} cells do not fit into {shape[0]} × {shape[1]} "
             "pixels; give fewer cells"
         )
     pattern = np.zeros(shape, np.uint8)
-    top, left = ((shape[axis] - size * cells.shape[axis]) // 2 for axis in (0, 1))
-    shown = np.kron(255 * cells, np.ones((size, size), np.uint8))
+    top, left = ((shape[axis] - size * levels.shape[axis]) // 2 for axis in (0, 1))
+    shown = np.kron(levels, np.ones((size, size), np.uint8))
     pattern[top : top + shown.shape[0], left : left + shown.shape[1]] = shown
     return pattern

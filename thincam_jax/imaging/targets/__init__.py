@@ -6,6 +6,7 @@ All are drawn eagerly, with the centre of the picture at the centre of the array
 
 from thincam_jax.imaging.targets.images import load_image as load_image
 from thincam_jax.imaging.targets.images import middle_square as middle_square
+from thincam_jax.imaging.targets.images import placed as placed
 from thincam_jax.imaging.targets.images import resize as resize
 from thincam_jax.imaging.targets.images import sample_image as sample_image
 from thincam_jax.imaging.targets.images import sample_images as sample_images

@@ -162,6 +162,30 @@ def _unit_range(pixels: np.ndarray, path: Path) -> np.ndarray:
     )
 
 
+def placed(
+    image: Float64[np.ndarray, "y x *channel"],
+    width: float = 1.0,
+    centre: tuple[float, float] = (0.0, 0.0),
+    rotation: float = 0.0,
+) -> Float64[np.ndarray, "y x *channel"]:
+    """The image smaller, moved and turned on black of its own shape.
+
+    - `width`, `centre`: of what it is on, in parts of its width; `centre` is (y, x), y downwards.
+    - `rotation`: clockwise as it is seen, rad, about its own middle.
+    """
+    if (width, *centre, rotation) == (1.0, 0.0, 0.0, 0.0):
+        return image
+    (rows, columns), size = image.shape[:2], image.shape[1]
+    smaller = resize(image, (max(1, round(width * rows)), max(1, round(width * columns))))
+    middle, own = ((np.array(i.shape[1::-1]) - 1) / 2 for i in (image, smaller))
+    cosine, sine = np.cos(rotation), np.sin(rotation)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    there = middle + size * np.array(centre[::-1]) - turn @ own
+    matrix = np.vstack([np.column_stack([turn, there]), [0, 0, 1]])
+    found = skimage.transform.warp(smaller, np.linalg.inv(matrix), output_shape=(rows, columns))
+    return np.clip(found, 0.0, 1.0)
+
+
 def middle_square(image: np.ndarray, side: int) -> np.ndarray:
     """The middle (side, side, …) of an image, one pixel at least."""
     side = max(1, side)

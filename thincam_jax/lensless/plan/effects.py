@@ -63,7 +63,9 @@ def _obliquity(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect
         )
         falls.append(np.mean((1 - np.asarray(light_over_field(camera.sensor, y, x))) ** 2))
     size = math.sqrt(float(np.mean(falls)))
-    return Effect("obliquity", False, size, _left_out(size, tolerance, "fall of light over the field"))
+    return Effect(
+        "obliquity", False, size, _left_out(size, tolerance, "fall of light over the field")
+    )
 
 
 def _left_out(size: float, tolerance: float, what: str) -> str:

@@ -2,9 +2,9 @@ r"""What a scene requires of the field: the PSF and the light of the axis, or th
 
 What the axis leaves out is a change of the transfer function that grows with the angle,
 :math:`H(\mathbf k; \mathbf u) - H(\mathbf k) \approx \sum_i u_i^2 A_i(\mathbf k) + u_i^4
-B_i(\mathbf k)` along the two axes i, and the fall of light w (`light_over_field`). The captured error of a scene
-f is then that of a few weighted scenes: with F their spectra, :math:`\sum_i A_i F[u_i^2 w f] + B_i
-F[u_i^4 w f] + H\,(F[wf] - F[f])`.
+B_i(\mathbf k)` along the two axes i, and the fall of light w (`light_over_field`). The captured
+error of a scene f is then that of a few weighted scenes: with F their spectra,
+:math:`\sum_i A_i F[u_i^2 w f] + B_i F[u_i^4 w f] + H\,(F[wf] - F[f])`.
 """
 
 import functools

@@ -1,0 +1,98 @@
+"""Pictures through a calibrated screen: calibrate, capture, reconstruct, by the commands."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+import skimage.io
+import yaml
+from commands.capture import tiny
+from commands.test_cli import call, one_line
+
+PICTURES = yaml.safe_load(tiny.HADAMARD) | {
+    "name": "tiny-pictures",
+    "plan": {"kind": "pictures", "cells": [8, 16], "frames": 2, "dark_frames": 2},
+    "matrix": "calibration.zarr",
+    "methods": [{"name": "CGM", "kind": "ridge"}, {"name": "TV", "kind": "admm_tv"}],
+    "targets": [
+        {"name": "bars", "kind": "file", "path": "bars.png"},
+        {"name": "turned", "kind": "file", "path": "bars.png", "width": 0.6, "rotation": "90 deg"},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The folder with the captures of a calibration and of two pictures."""
+    folder = tmp_path_factory.mktemp("pictures")
+    before = os.getcwd()
+    os.chdir(folder)
+    bars = np.zeros((8, 16), np.uint8)
+    bars[2:6, 3:7], bars[1:7, 11] = 250, 120
+    skimage.io.imsave(folder / "bars.png", bars, check_contrast=False)
+    for name, raw in (("calibration", yaml.safe_load(tiny.HADAMARD)), ("pictures", PICTURES)):
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(raw), "utf-8")
+        result = call("capture", f"{name}.yaml", "--out", f"{name}.zarr")
+        assert result.exit_code == 0, result.output
+    assert "6 frames; next: thincam run" in result.stdout.replace("\n", "")
+    yield folder
+    os.chdir(before)
+
+
+def test_pictures_come_back(home):
+    """By the captures of the calibration, and by the matrix that their own run made."""
+    result = call("run", "pictures.zarr", "--out", "found")
+    assert result.exit_code == 0, result.output
+    scores = json.loads((home / "found/metrics.json").read_text("utf-8"))["methods"]
+    for method in ("CGM", "TV"):
+        of_targets = scores[method]["targets"]
+        assert of_targets["bars"]["psnr_db"] > 22
+        assert of_targets["turned"]["psnr_db"] > 22
+    image = skimage.io.imread(home / "found/bars--tv.png")
+    assert image[3, 4] > image[3, 11] > image[0, 0]
+    page = (home / "found/report.html").read_text("utf-8")
+    assert "Beside what was published" in page and "turned" in page
+    again = call("run", "pictures.zarr", "--out", "again", "--set", "matrix=found/matrix.zarr")
+    assert again.exit_code != 0  # a store has its own file
+    text = (home / "pictures.zarr/config.yaml").read_text("utf-8")
+    assert "calibration.zarr" in text
+    other = home / "other.zarr"
+    shutil.copytree(home / "pictures.zarr", other)
+    (other / "config.yaml").write_text(
+        text.replace("calibration.zarr", "found/matrix.zarr"), "utf-8"
+    )
+    assert call("run", "other.zarr", "--out", "again").exit_code == 0
+    there = json.loads((home / "again/metrics.json").read_text("utf-8"))["methods"]
+    assert there["TV"]["targets"] == scores["TV"]["targets"]
+
+
+def test_a_changed_picture_is_another_plan(home):
+    other = np.full((8, 16), 30, np.uint8)
+    other[0, 0] = 255
+    skimage.io.imsave(home / "other.png", other, check_contrast=False)
+    change = "targets=[{name: bars, kind: file, path: other.png}]"
+    args = ("capture", "pictures.yaml", "--out", "pictures.zarr", "--resume", "--set", change)
+    assert "another plan" in one_line(call(*args))
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ("matrix=null", "matrix: a plan of kind pictures needs it"),
+        ("targets=[]", "targets: a plan of kind pictures needs them"),
+        ("plan.kind=hadamard", "plan.frames: a plan of kind hadamard takes cells, order, display"),
+        ("virtual.screen.object.cells=[8, 8]", "virtual.screen.object.cells: the plan shows"),
+    ],
+)
+def test_files_that_do_not_fit(home, asked, line):
+    assert line in one_line(call("capture", "pictures.yaml", "--out", "x.zarr", "--set", asked))
+
+
+def test_a_matrix_of_other_cells_is_told_of(home):
+    text = (home / "pictures.zarr/config.yaml").read_text("utf-8")
+    store = home / "none.zarr"
+    shutil.copytree(home / "pictures.zarr", store)
+    (store / "config.yaml").write_text(text.replace("calibration.zarr", "nothing.zarr"), "utf-8")
+    assert "nothing.zarr" in one_line(call("run", "none.zarr", "--out", "x"))

@@ -1,0 +1,114 @@
+"""What is to be captured, as numbers: the plan of a file, checked before devices are opened."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal, get_args
+
+import numpy as np
+
+from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
+from thincam_jax.hardware.acquisition import plan as plans
+from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.lensless.masks.fza import PROFILES, Profile
+from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, HadamardSeries, Order
+
+PlanKind = Literal["fringe_scan", "method_a", "method_b", "psf_stack", "hadamard", "pictures"]
+MONITOR = "hadamard", "pictures"  # plans of a monitor's cells
+# What each kind needs, and what it may have beside the dark frames.
+_ZONES = ("betas", "width")
+_NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "fringe_scan": (_ZONES, ("profile",)),
+    "method_a": ((*_ZONES, "distances"), ("profile",)),
+    "method_b": (_ZONES, ("profile",)),
+    "psf_stack": ((*_ZONES, "distances"), ("profile", "phase")),
+    "hadamard": (("cells",), ("order", "display")),
+    "pictures": (("cells",), ("frames",)),
+}
+_MM = quantity("mm", positive=True, many=True)
+_CELLS = whole(1, 65536, optional=True, many=True)
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """What is captured.
+
+    - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
+      `profile`, `phase`: of all of them.
+    - `distances`: mask-sensor distances (method_a) or those of
+      what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
+    - `cells`: rows and columns of cells on a monitor.
+    - `order`, `display`: of the Hadamard patterns.
+    - `frames`: of each picture, whose mean counts.
+    - `dark_frames`: in all; they are spread over the plan.
+
+    **Errors**: FieldError for what the kind lacks or does not take.
+    """
+
+    kind: Annotated[PlanKind, choice(get_args(PlanKind))]
+    betas: Annotated[tuple[float, ...], quantity("rad/mm^2", positive=True, many=True)] = ()
+    width: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
+    profile: Annotated[Profile, choice(PROFILES)] = "cosine"
+    phase: Annotated[float, quantity("rad")] = 0.0
+    distances: Annotated[tuple[float, ...], _MM] = ()
+    cells: Annotated[tuple[int, int] | None, _CELLS] = None
+    order: Annotated[Order, choice(get_args(Order))] = "sequency"
+    display: Annotated[Display, choice(get_args(Display))] = "complementary"
+    frames: Annotated[int, whole(1, 1000)] = 1
+    dark_frames: Annotated[int, DARK_FRAMES] = 0
+
+    def __post_init__(self):
+        check_fields(self)
+        # A resolved file names the defaults, too.
+        given = {f.name for f in fields(self) if getattr(self, f.name) != f.default}
+        needed, also = _NUMBERS[self.kind]
+        allowed = (*needed, *also)
+        for key in needed:
+            if not getattr(self, key):
+                raise FieldError(f"a plan of kind {self.kind} needs it", key)
+        for key in sorted(given.difference((*allowed, "kind", "dark_frames"))):
+            raise FieldError(f"a plan of kind {self.kind} takes {', '.join(allowed)}; drop it", key)
+        if self.kind == "method_b" and len(self.betas) < 2:
+            raise FieldError("method_b compares two β or more; give another", "betas")
+        if self.kind not in ("method_b", *MONITOR) and len(self.betas) != 1:
+            raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
+        for key in ("betas", "distances"):
+            if len(set(getattr(self, key))) < len(getattr(self, key)):
+                raise FieldError("an entry stands twice; give each once", key)
+        if self.kind == "hadamard":
+            try:
+                _ = self.series
+            except ValueError as error:
+                raise FieldError(str(error), "cells") from None
+
+    @property
+    def series(self) -> HadamardSeries:
+        """Of a plan of kind hadamard."""
+        assert self.cells is not None
+        return HadamardSeries(self.cells, self.order, self.display, self.dark_frames)
+
+    def plan(
+        self,
+        settings: CameraSettings,
+        *,
+        stage_zero: float = 0.0,
+        shown: Mapping[str, np.ndarray] | None = None,
+    ) -> plans.Plan:
+        """The steps.
+
+        - `stage_zero`: distance at the stage's position 0, mm.
+        - `shown`: levels of the pictures on the cells, uint8, by name.
+        """
+        dark = {"dark_frames": self.dark_frames}
+        if self.kind == "hadamard":
+            return plans.hadamard(self.series, settings)
+        if self.kind == "pictures":
+            return plans.pictures(shown or {}, settings, frames=self.frames, **dark)
+        mask = plans.zone_plate(
+            self.betas[0], self.width or 0.0, phase=self.phase, profile=self.profile
+        )
+        if self.kind == "method_b":
+            return plans.method_b(mask, self.betas, settings, **dark)
+        if self.kind == "fringe_scan":
+            return plans.fringe_scan(mask, settings, **dark)
+        of_distances = plans.method_a if self.kind == "method_a" else plans.psf_stack
+        return of_distances(mask, self.distances, settings, stage_zero=stage_zero, **dark)

@@ -1,0 +1,111 @@
+"""Pictures on the cells of a monitor: reconstructed from captures by a matrix, and scored."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core.table import Table
+from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.operators import AbstractOperator
+from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Recording, reconstruct
+from thincam_jax.studies.evaluate import rounded
+
+
+class ScreenCaptures(eqx.Module):
+    """Captures (target, *channel, y, x), or reduced ones, and the variance of their noise."""
+
+    images: Array
+    variance: Array
+
+
+def reconstruct_targets(
+    system: AbstractOperator, solver: AbstractSolver, captures: ScreenCaptures
+) -> Reconstruction:
+    """All targets at once, (target, *channel, y, x)."""
+    variance = captures.variance[None]
+    return reconstruct(Recording(captures.images[None], [system], noise_variance=variance), solver)
+
+
+@dataclass(frozen=True)
+class TargetScores:
+    """Agreement of a reconstruction with its target; the PSNR of an exact one is None."""
+
+    psnr_db: float | None
+    ssim: float
+
+
+@dataclass(frozen=True)
+class MethodScores:
+    """Figures of merit of a solver with a model; `targets` by name. The time has compilation."""
+
+    mean_psnr_db: float | None
+    seconds_per_image: float
+    status: str
+    iterations: int
+    targets: dict[str, TargetScores]
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """The targets as a solver reconstructs them with a model, and their scores."""
+
+    images: Float[np.ndarray, "target y x *channel"]
+    scores: MethodScores
+
+
+def reconstructed(
+    targets: Mapping[str, np.ndarray],
+    solver: AbstractSolver,
+    system: AbstractOperator,
+    captures: ScreenCaptures,
+) -> Reconstructed:
+    """Reconstruct targets from captures by a matrix, and score them."""
+    began = time.perf_counter()
+    found = reconstruct_targets(system, solver, captures)
+    images = np.asarray(found.image, float)
+    images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
+    seconds = time.perf_counter() - began
+    pairs = list(zip(images, targets.values(), strict=True))
+    scores = [psnr(image, truth) for image, truth in pairs]
+    of_targets = {
+        name: TargetScores(rounded(score), round(ssim(image, truth), 4))
+        for name, score, (image, truth) in zip(targets, scores, pairs, strict=True)
+    }
+    means = rounded(float(np.mean(scores))), round(seconds / len(images), 3)
+    return Reconstructed(images, MethodScores(*means, found.status, found.iterations, of_targets))
+
+
+@dataclass(frozen=True)
+class PublishedImage:
+    """Figures that a publication gives for a target and a solver; None where it gives none."""
+
+    psnr_db: float | None = None
+    seconds: float | None = None
+
+
+def beside(
+    found: Mapping[str, Reconstructed], published: Mapping[str, Mapping[str, PublishedImage]]
+) -> Table:
+    """Scores of every target, beside what was published of it.
+
+    - `found`: by solver. `published`: by target and solver; either may be missing.
+    """
+    methods = {name: one.scores for name, one in found.items()}
+    rows = []
+    for target in next(iter(methods.values())).targets:
+        own = [scores.targets[target] for scores in methods.values()]
+        stated = [published.get(target, {}).get(name, PublishedImage()) for name in methods]
+        others = (number for one in stated for number in (one.psnr_db, one.seconds))
+        rows.append((target, *(n for one in own for n in (one.psnr_db, one.ssim)), *others))
+    seconds = (t for s in methods.values() for t in (f"{s.seconds_per_image:.2f}", ""))
+    rows.append(("time for an image, s", *seconds, *[""] * (2 * len(methods))))
+    ours = (heading for name in methods for heading in (f"{name}\nPSNR dB", "SSIM"))
+    theirs = (h for name in methods for h in (f"published\n{name}, dB", "published\ns"))
+    count = 2 * len(methods)
+    digits = (*(1, 3) * len(methods), *(1,) * count)
+    columns = range(count + 1, 2 * count + 1)
+    return Table(("target", *ours, *theirs), rows, digits, published=columns)
