@@ -50,7 +50,7 @@ def test_pictures_come_back(home):
         of_targets = scores[method]["targets"]
         assert of_targets["bars"]["psnr_db"] > 22
         assert of_targets["turned"]["psnr_db"] > 22
-    image = skimage.io.imread(home / "found/bars--tv.png")
+    image = skimage.io.imread(home / "found/images/bars--tv.png")
     assert image[3, 4] > image[3, 11] > image[0, 0]
     page = (home / "found/report.html").read_text("utf-8")
     assert "Beside what was published" in page and "turned" in page

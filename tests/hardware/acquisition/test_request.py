@@ -51,5 +51,3 @@ def test_what_does_not_fit(given, field, message):
 def test_wrong_numbers():
     with pytest.raises(ValueError, match="betas = -25"):
         PlanRequest("fringe_scan", betas=(-25.0,), width=1.4)
-    with pytest.raises(ValueError, match="kind = 'film'"):
-        PlanRequest("film")  # pyright: ignore[reportArgumentType]

@@ -140,23 +140,15 @@ def known_drivers() -> list[str]:
 
 def build_plan(config: "CaptureConfig") -> "Plan":
     """The plan of a file, with its settings."""
+    from thincam_jax.commands.capture.run import picture_levels
     from thincam_jax.hardware.base import CameraSettings
 
     settings = config.camera.build(CameraSettings)
     zero = 0.0 if config.optics is None else config.optics.distance
-    plan = config.plan.build().plan(settings, stage_zero=zero, shown=_levels(config))
+    plan = config.plan.build().plan(settings, stage_zero=zero, shown=picture_levels(config))
     if config.stage is not None:  # it stands where the optics are known
         plan = plan.at_position(0.0)
     return plan
-
-
-def _levels(config: "CaptureConfig") -> dict[str, Any]:
-    """Of the pictures of a plan on its cells, uint8, by name."""
-    if config.plan.kind != "pictures":
-        return {}
-    from thincam_jax.commands.capture.run import pictures
-
-    return {name: (255 * one).round().astype("uint8") for name, one in pictures(config).items()}
 
 
 @contextlib.contextmanager
@@ -165,10 +157,11 @@ def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
 
     **Errors**: ConfigError for options of a driver, and for what the display cannot show.
     """
+    from thincam_jax.commands.capture.run import picture_levels
     from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.hardware.acquisition.rig import open_rig
 
-    pitch, virtual, pictures = config.display.pitch, None, _levels(config)
+    pitch, virtual, pictures = config.display.pitch, None, picture_levels(config)
     if config.rig == "virtual":
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
@@ -231,7 +224,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     import numpy as np
 
     from thincam_jax._core.files import read_regular
-    from thincam_jax.commands.capture.run import Taken
+    from thincam_jax.commands.capture.run import Taken, picture_levels
     from thincam_jax.hardware.acquisition.read import read_acquisition
     from thincam_jax.hardware.virtual.rig import Electronics
     from thincam_jax.measured.calibration import open_captures
@@ -244,7 +237,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     else:
         frames = found.captures()
     patterns, virtual = found.patterns[: len(frames)], config.virtual
-    pictures = _levels(config)
+    pictures = picture_levels(config)
     darks = sum(step.dark for step in found.plan.steps)
     if config.rig == "virtual" and virtual is not None:
         electron, offset = virtual.build(Electronics).scale(found.settings[0])

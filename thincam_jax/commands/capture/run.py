@@ -16,8 +16,8 @@ from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.run import PUBLISHED, build_cameras, build_plane, published_figures
 from thincam_jax.commands.screen.run import build_solver as build_solver_of
-from thincam_jax.commands.sections import PHASES, SensorConfig, TargetConfig, build_solver
-from thincam_jax.commands.study.build import build_optics, picture, read_target
+from thincam_jax.commands.sections import PHASES, PictureConfig, SensorConfig, build_solver
+from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
@@ -143,7 +143,8 @@ class _CaptureRun(Run):
         try:
             known = calibrated(Path(config.matrix or ""), self.folder.path)
             solvers = {method.name: build_solver_of(method) for method in config.methods}
-            found = reconstruct_pictures(pictures(config), taken.frames, known, solvers)
+            shown = {name: levels / 255 for name, levels in picture_levels(config).items()}
+            found = reconstruct_pictures(shown, taken.frames, known, solvers)
         except ValueError as error:
             raise ConfigError(f"{config.place_of('matrix')}matrix: {error}") from None
         self.folder.save_figure(
@@ -202,9 +203,10 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     ).at_phases(phases)
     solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
 
-    def grey(entry: TargetConfig) -> Target:
+    def grey(entry: PictureConfig) -> Target:
         """Of one light: colours are averaged."""
-        target = read_target(entry, optics.object)
+        seen = optics.object
+        target = Target.of_image(entry.name, picture(entry), seen.distance, seen.width, entry.kind)
         image = target.plane.image.mean(axis=0)
         return replace(target, plane=ImagePlane(image, target.distance, target.width))
 
@@ -222,15 +224,18 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     )
 
 
-def pictures(config: CaptureConfig) -> dict[str, np.ndarray]:
-    """Of a plan of pictures, radiance 0 to 1 on its cells, by name.
+def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
+    """Of the pictures of a plan, if it shows any, on its cells, uint8, by name.
 
     **Errors**: ConfigError for pictures that cannot be read.
     """
-    cells = config.plan.cells or (0, 0)
-    found = config.read_all("targets", lambda one: picture(one, cells), "path")
-    levels = [np.rint(255 * one).astype(np.uint8) for one in found]
-    return {one.name: level / 255 for one, level in zip(config.targets, levels, strict=True)}
+    if config.plan.kind != "pictures":
+        return {}
+
+    def levels(one: PictureConfig) -> tuple[str, np.ndarray]:
+        return one.name, np.rint(255 * picture(one, config.plan.cells)).astype(np.uint8)
+
+    return dict(config.read_all("targets", levels, "path"))
 
 
 def screen_system(config: CaptureConfig) -> Sparse:
@@ -271,19 +276,12 @@ def page(
         Picture("frames.png", "Frames taken", "What the camera took, without the dark frame."),
     )
     found = {} if agreement is None else asdict(agreement)
-    rows = [(name.replace("_", " "), _numbers(value)) for name, value in found.items()]
+    rows = [(name.replace("_", " "), str(value).strip("[]")) for name, value in found.items()]
     time = Picture("seconds.png", "Time of the steps", "Time of all frames, by step.")
-    explained = (
-        "Differences over the standard deviation that the noise has: 1 is agreement within the "
-        "noise."
-    )
+    explained = "Differences over the noise's standard deviation: 1 is agreement within it."
     compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
     parts = [compared] if rows else []
     parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
     parts += [Part("Time", (time,))] if taken.seconds else []
     parts += [Part("Notes", config.notes)] if config.notes else []
     return Page(lead, parts)
-
-
-def _numbers(value: Any) -> str:
-    return ", ".join(str(v) for v in value) if isinstance(value, list) else str(value)

@@ -110,17 +110,22 @@ def read_picture(target: TargetConfig) -> np.ndarray:
     return getattr(drawn, target.kind)(shape)
 
 
-def picture(target: PictureConfig, cells: tuple[int, int], channels: int = 0) -> np.ndarray:
+def picture(
+    target: PictureConfig, cells: tuple[int, int] | None = None, channels: int = 0
+) -> np.ndarray:
     """A target on cells, radiance 0 to 1: (y, x), or with so many channels (y, x, channel).
+
+    Without cells, on its own pixels.
 
     **Errors**: ValueError for a uniform picture, FileNotFoundError where there is none.
     """
     picture = np.atleast_3d(read_picture(target))
     if target.crop < 1:
         picture = drawn.middle_square(picture, round(target.crop * min(picture.shape[:2])))
-    picture = drawn.resize(picture if channels else picture.mean(axis=-1), cells)
+    picture = picture if channels else picture.mean(axis=-1)
+    picture = drawn.resize(picture, cells or (picture.shape[0], picture.shape[1]))
     if channels:
-        picture = np.broadcast_to(picture, (*cells, channels))
+        picture = np.broadcast_to(picture, (*picture.shape[:2], channels))
     if target.binary:
         picture = (picture > picture.mean()).astype(float)
     picture = drawn.placed(picture, target.width, (target.y, target.x), target.rotation)
