@@ -41,6 +41,7 @@ def home(tmp_path_factory):
     os.chdir(before)
 
 
+@pytest.mark.thorough
 def test_pictures_come_back(home):
     """By the captures of the calibration, and by the matrix that their own run made."""
     result = call("run", "pictures.zarr", "--out", "found")

@@ -257,7 +257,10 @@ def page(
     table: Table | None = None,
 ) -> Page:
     """The page of a finished run."""
-    beside = ", beside that of a direct simulation with other noise, and without"
+    images = "What is reconstructed"
+    images += (
+        ", beside that of a direct simulation with other noise, and without." if agreement else "."
+    )
     seen = "What the sensor sees of single cells (row, column)"
     seen += ": measured, and by direct simulation. " if agreement else ". "
     devices = [f"display {config.display.driver}"]
@@ -266,22 +269,19 @@ def page(
         f"Plan {config.plan.kind.replace('_', ' ')} on a {config.rig} rig: camera "
         f"{config.camera.driver}, exposure {1000 * config.camera.exposure:g} ms; "
         f"{'; '.join(devices)}.",
-        Picture(
-            "images.png",
-            "Reconstructions",
-            f"The image reconstructed{beside if agreement else ''}.",
-        ),
+        Picture("images.png", "Reconstructions", images),
         Picture("columns.png", "Columns of the system matrix", seen + _MATRIX),
         Picture("shown.png", "Patterns shown", "What the display showed."),
         Picture("frames.png", "Frames taken", "What the camera took, without the dark frame."),
     )
     found = {} if agreement is None else asdict(agreement)
     rows = [(name.replace("_", " "), str(value).strip("[]")) for name, value in found.items()]
-    time = Picture("seconds.png", "Time of the steps", "Time of all frames, by step.")
     explained = "Differences over the noise's standard deviation: 1 is agreement within it."
     compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
     parts = [compared] if rows else []
     parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
-    parts += [Part("Time", (time,))] if taken.seconds else []
+    if taken.seconds:
+        time = Picture("seconds.png", "Time of the steps", "Time of all frames, by step.")
+        parts.append(Part("Time", (time,)))
     parts += [Part("Notes", config.notes)] if config.notes else []
     return Page(lead, parts)
