@@ -187,4 +187,4 @@ def read_value(text: str, asked: str) -> Any:
 
 def slug(name: str) -> str:
     """A name as a file name."""
-    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-.") or "unnamed"
+    return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-._") or "unnamed"
