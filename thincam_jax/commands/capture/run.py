@@ -257,10 +257,8 @@ def page(
     table: Table | None = None,
 ) -> Page:
     """The page of a finished run."""
-    images = "What is reconstructed"
-    images += (
-        ", beside that of a direct simulation with other noise, and without." if agreement else "."
-    )
+    beside_it = ", beside that of a direct simulation with other noise, and without"
+    images = f"What is reconstructed{beside_it if agreement else ''}."
     seen = "What the sensor sees of single cells (row, column)"
     seen += ": measured, and by direct simulation. " if agreement else ". "
     devices = [f"display {config.display.driver}"]
