@@ -23,17 +23,18 @@ def passes(flags, arguments):
     assert " passed" in done.stdout
 
 
-def test_a_sample_passes_with_default_flags():
-    """Propagation, an operator, a step of ADMM with its gradient: others compile unoptimised."""
-    passes(
-        "",
-        [
-            "tests/lensless/propagation/test_closed_form.py::test_is_the_thesis_formula[6.5-inf]",
-            "tests/imaging/operators/test_crop_convolution.py"
-            "::test_it_is_the_integral_over_the_field[sensor1-field1]",
-            "tests/reconstruction/test_splittings.py::test_single_precision_and_gradients[1]",
-        ],
-    )
+SAMPLES = [
+    "tests/lensless/propagation/test_closed_form.py::test_is_the_thesis_formula[6.5-inf]",
+    "tests/imaging/operators/test_crop_convolution.py"
+    "::test_it_is_the_integral_over_the_field[sensor1-field1]",
+]
+SOLVED = ["tests/reconstruction/test_splittings.py::test_single_precision_and_gradients[1]"]
+
+
+@pytest.mark.parametrize("sample", [SAMPLES, pytest.param(SOLVED, marks=pytest.mark.thorough)])
+def test_a_sample_passes_with_default_flags(sample):
+    """Propagation and an operator; a step of ADMM with its gradient: others are unoptimised."""
+    passes("", sample)
 
 
 def has_avx512() -> bool:
