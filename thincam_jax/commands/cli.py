@@ -178,11 +178,15 @@ def options(
 
 @app.command()
 @with_output
-def doctor() -> None:
+def doctor(
+    devices: Annotated[bool, typer.Option(help="What is connected, by looking alone.")] = False,
+    ask: Annotated[str | None, typer.Option(help="A serial port to ask what it is.")] = None,
+) -> None:
     """Print versions, devices and what is missing."""
     with told(lambda: "interrupted"):
         from thincam_jax._core.environment import machine_report, package_report
 
         programs = f"compiled programs: {cache_state()}"
-        lines = [*machine_report(), programs, *package_report(), *known_drivers()]
+        hardware = known_drivers(devices, ask)
+        lines = [*machine_report(), programs, *package_report(), *hardware]
         say_result("report", lines, "\n".join(lines))

@@ -23,7 +23,6 @@ from thincam_jax.commands.terminal import (
 
 if TYPE_CHECKING:
     from thincam_jax.learn.training import TrainingProgress
-    from thincam_jax.studies.design_scores import DesignScores
 
 
 def run(
@@ -110,17 +109,8 @@ def design(
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
     show(found.table())
-    say(_levels(found))
+    say(found.levels())
     say_result("report", folder.path / "report.html")
-
-
-def _levels(found: "DesignScores") -> str:
-    """What the gains are over, in a sentence."""
-    name = found.reference.name
-    of_pictures = found.validation.methods[name]
-    levels = {target: of_pictures[target].psnr_db for target in found.validation.pictures}
-    known = [f"{target} {psnr.mean:.2f} dB" for target, psnr in levels.items() if psnr]
-    return f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}"
 
 
 def train(

@@ -5,6 +5,7 @@ streams and releases the device. A driver raises `HardwareError` and nothing els
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
@@ -28,6 +29,24 @@ class Identity:
         return f"{self.vendor} {self.model} ({self.serial})"
 
 
+@dataclass(frozen=True)
+class Connected:
+    """A device that is there, unopened.
+
+    - `kind`: "camera", "stage", "display" or "serial port". `driver`, `options`: what a file names
+      it by. `about`: what it is called, or why it cannot be asked.
+    """
+
+    kind: str
+    driver: str
+    options: Mapping[str, Any]
+    about: str
+
+    def __str__(self) -> str:
+        chosen = ", ".join(f"{name}: {value}" for name, value in self.options.items())
+        return f"{self.kind} {self.driver} {{{chosen}}}: {self.about}".replace("  ", " ")
+
+
 class Device(ABC):
     """An open device, with its `identity`; `Options` are those of its driver in a config file."""
 
@@ -41,6 +60,14 @@ class Device(ABC):
         `NotFound`, `Busy` or `PermissionDenied` where that fails.
         """
         return cls(options)  # pyright: ignore[reportCallIssue]
+
+    @classmethod
+    def connected(cls) -> list[Connected]:
+        """Devices of this driver that are there, found without opening or changing any.
+
+        None where only an open device can tell.
+        """
+        return []
 
     @abstractmethod
     def close(self) -> None:

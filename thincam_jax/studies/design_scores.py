@@ -304,6 +304,14 @@ class DesignScores:
     warnings: list[str]
     pareto: FrontsScores | None = None
 
+    def levels(self) -> str:
+        """What the gains are over, in a sentence."""
+        name = self.reference.name
+        of_pictures = self.validation.methods[name]
+        levels = {target: of_pictures[target].psnr_db for target in self.validation.pictures}
+        known = [f"{target} {psnr.mean:.2f} dB" for target, psnr in levels.items() if psnr]
+        return f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}"
+
     def table(self) -> Table:
         """The designs that were simulated, with their gains over the one to beat."""
         validation = self.validation

@@ -131,11 +131,17 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
     return folder.path
 
 
-def known_drivers() -> list[str]:
-    """A line for each driver of a device."""
-    from thincam_jax.hardware.registry import driver_report
+def known_drivers(connected: bool = False, asked: str | None = None) -> list[str]:
+    """A line for each driver; each device that is there; what answers at a serial port."""
+    from thincam_jax.commands.config_file import ConfigError
+    from thincam_jax.hardware import discovery, registry
+    from thincam_jax.hardware.errors import HardwareError
 
-    return driver_report()
+    try:
+        there = discovery.report(asked) if connected or asked else []
+    except HardwareError as error:
+        raise ConfigError(str(error)) from None
+    return registry.driver_report() + there
 
 
 def build_plan(config: "CaptureConfig") -> "Plan":

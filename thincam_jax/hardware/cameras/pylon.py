@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from thincam_jax.hardware import errors
-from thincam_jax.hardware.base import CameraSettings, Frame, Identity
+from thincam_jax.hardware.base import CameraSettings, Connected, Frame, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
     FeatureCamera,
@@ -60,6 +60,18 @@ class PylonCamera(FeatureCamera):
         ticks = "GevTimestampTickFrequency"  # of GigE Vision; USB3 Vision counts nanoseconds
         self._tick = 1 / float(features.get(ticks)) if features.has(ticks) else 1e-9
         trigger_by_software(features)
+
+    @classmethod
+    def connected(cls) -> list[Connected]:
+        return [
+            Connected(
+                "camera",
+                "pylon",
+                {"serial": info.GetSerialNumber()},
+                f"{info.GetVendorName()} {info.GetModelName()}",
+            )
+            for info in pylon.TlFactory.GetInstance().EnumerateDevices()
+        ]
 
     @classmethod
     def open(cls, options: Options) -> "PylonCamera":

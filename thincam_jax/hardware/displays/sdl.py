@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax.hardware.base import Identity
+from thincam_jax.hardware.base import Connected, Identity
 from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
 from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
 
@@ -57,9 +57,24 @@ class SdlDisplay(Screen):
             self.close()
             raise
 
+    @classmethod
+    def connected(cls) -> list[Connected]:
+        if sdl2.SDL_InitSubSystem(sdl2.SDL_INIT_VIDEO) != 0:
+            return []  # no monitor, or none that this session may use
+        found, bounds, dots = [], sdl2.SDL_Rect(), ctypes.c_float()
+        try:
+            for number, name in enumerate(_names()):
+                sdl2.SDL_GetDisplayBounds(number, ctypes.byref(bounds))
+                known = sdl2.SDL_GetDisplayDPI(number, None, ctypes.byref(dots), None) == 0
+                pitch = f" of {25.4 / dots.value:.4g} mm" if known and dots.value > 0 else ""
+                about = f"{bounds.h} × {bounds.w} pixels{pitch}, at x {bounds.x}, y {bounds.y}"
+                found.append(Connected("display", "sdl", {"monitor": name or number}, about))
+        finally:
+            sdl2.SDL_QuitSubSystem(sdl2.SDL_INIT_VIDEO)
+        return found
+
     def _open(self, options: Options) -> None:
-        count = sdl2.SDL_GetNumVideoDisplays()
-        names = [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
+        names = _names()
         number = _chosen(options.monitor, names)
         bounds = sdl2.SDL_Rect()
         sdl2.SDL_GetDisplayBounds(number, ctypes.byref(bounds))
@@ -134,6 +149,12 @@ class SdlDisplay(Screen):
         columns, rows = ctypes.c_int(), ctypes.c_int()
         sdl2.SDL_GetRendererOutputSize(self._renderer, ctypes.byref(columns), ctypes.byref(rows))
         return rows.value, columns.value
+
+
+def _names() -> list[str]:
+    """Of the monitors, by their numbers."""
+    count = sdl2.SDL_GetNumVideoDisplays()
+    return [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
 
 
 def _chosen(wanted: str, names: list[str]) -> int:

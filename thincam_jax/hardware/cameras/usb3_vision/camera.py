@@ -5,12 +5,15 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from thincam_jax.hardware.base import CameraSettings, Frame, Identity
+import usb.core
+import usb.util
+
+from thincam_jax.hardware.base import CameraSettings, Connected, Frame, Identity
 from thincam_jax.hardware.cameras.features import FeatureCamera, read, trigger_by_software
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.features import Features, fetch_xml
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
-from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink
+from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink, cameras_there
 from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS, Stream, unpack
 from thincam_jax.hardware.errors import HardwareError, Timeout
 
@@ -37,6 +40,20 @@ class Usb3VisionCamera(FeatureCamera):
         serial: str = ""
         backend: Any = None
         compare_clocks: bool = True
+
+    @classmethod
+    def connected(cls, backend: Any = None) -> list[Connected]:
+        found = []
+        for device in cameras_there(backend=backend):
+            try:
+                options = {"serial": device.serial_number or ""}
+                about = f"{device.manufacturer} {device.product}"
+            except (ValueError, usb.core.USBError):  # pyusb without permission: "no langid"
+                options, about = {}, "this user may not open it; `thincam capture` says how"
+            finally:
+                usb.util.dispose_resources(device)
+            found.append(Connected("camera", "usb3_vision", options, about))
+        return found
 
     @classmethod
     def open(cls, options: Options) -> "Usb3VisionCamera":

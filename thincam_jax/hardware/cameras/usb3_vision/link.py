@@ -60,28 +60,33 @@ def _endpoint(interface: Any, direction: int) -> Any:
     return None
 
 
+def cameras_there(name: str = "USB3 Vision cameras", backend: Any = None) -> list[Any]:
+    """Every USB3 Vision camera, unopened; NotFound where USB cannot be listed."""
+    try:
+        devices = usb.core.find(
+            find_all=True,
+            backend=backend,
+            custom_match=lambda d: (
+                _interface(d, CONTROL_INTERFACE) is not None
+                and _interface(d, STREAM_INTERFACE) is not None
+            ),
+        )
+        return list(devices or ())
+    except usb.core.NoBackendError as error:
+        remedy = "install libusb 1.0 (Debian: apt install libusb-1.0-0)"
+        raise NotFound(name, "open", "libusb is not installed", remedy) from error
+    except usb.core.USBError as error:
+        remedy = "check that this system has USB"
+        raise NotFound(name, "open", f"USB cannot be listed: {error}", remedy) from error
+
+
 class UsbLink:
     """A claimed USB3 Vision camera and its three bulk endpoints."""
 
     def __init__(self, serial: str = "", backend: Any = None):
         """Claim the camera of this serial number, or the only one; by libusb without a backend."""
         self.name = f"USB3 Vision camera {serial}".rstrip()
-        try:
-            devices = usb.core.find(
-                find_all=True,
-                backend=backend,
-                custom_match=lambda d: (
-                    _interface(d, CONTROL_INTERFACE) is not None
-                    and _interface(d, STREAM_INTERFACE) is not None
-                ),
-            )
-            candidates: list[Any] = list(devices or ())
-        except usb.core.NoBackendError as error:
-            remedy = "install libusb 1.0 (Debian: apt install libusb-1.0-0)"
-            raise NotFound(self.name, "open", "libusb is not installed", remedy) from error
-        except usb.core.USBError as error:
-            remedy = "check that this system has USB"
-            raise NotFound(self.name, "open", f"USB cannot be listed: {error}", remedy) from error
+        candidates = cameras_there(self.name, backend)
         if not serial and len(candidates) == 1:
             (self._device,) = candidates
         else:

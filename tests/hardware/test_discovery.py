@@ -1,0 +1,116 @@
+"""Discovery: what is found, that nothing is changed by looking, and what a port answers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from commands.test_cli import call, one_line
+
+from thincam_jax.hardware import discovery, registry
+from thincam_jax.hardware.base import CameraSettings, Connected, Device
+from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
+from thincam_jax.hardware.errors import Busy, NotFound
+from thincam_jax.hardware.virtual.grbl import VirtualGrbl
+from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
+from thincam_jax.hardware.virtual.zaber import VirtualZaber
+
+
+class Watched(VirtualUsb3Vision):
+    """Notes what is written to it and claimed of it."""
+
+    def __init__(self):
+        super().__init__(lambda settings: np.zeros((32, 48), np.uint16), (32, 48))
+        self.written = []
+
+    def bulk_write(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.written.append(args)
+        return super().bulk_write(*args)
+
+    def claim_interface(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.written.append(args)
+        return super().claim_interface(*args)
+
+
+def test_a_camera_is_read_by_its_descriptors_alone():
+    backend = Watched()
+    (found,) = Usb3VisionCamera.connected(backend)
+    assert (found.kind, found.driver) == ("camera", "usb3_vision")
+    assert not backend.written and not backend._open
+    options = Usb3VisionCamera.Options(**found.options, backend=backend)
+    with Usb3VisionCamera.open(options) as camera:
+        assert camera.identity.serial == found.options["serial"]
+        assert camera.identity.vendor in found.about and camera.identity.model in found.about
+        camera.configure(CameraSettings(exposure=0.01))
+        assert Usb3VisionCamera.connected(backend) == [found]  # also while it is in use
+
+
+def test_cameras_of_pylon_and_monitors(monkeypatch):
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    found = discovery.connected_devices()
+    assert sum(one.driver == "pylon" for one in found) >= 1
+    (monitor,) = (one for one in found if one.driver == "sdl")
+    assert "pixels" in monitor.about and "at x 0, y 0" in monitor.about
+    assert str(monitor).startswith("display sdl {monitor: ")
+
+
+class Noted(VirtualZaber):
+    received = b""
+
+    def _receive(self, data):
+        self.received += data
+        super()._receive(data)
+
+
+class NotedGrbl(VirtualGrbl):
+    received = b""
+
+    def _receive(self, data):
+        self.received += data
+        super()._receive(data)
+
+
+def test_a_zaber_stage_answers_and_stays_as_it_is():
+    with Noted() as stage:
+        place, port = stage.true_position, str(stage.port)
+        (found,) = discovery.ask_port(port)
+        assert (found.driver, dict(found.options)) == ("zaber", {"port": port, "device": 1})
+        assert found.about == "serial 12345"
+        assert stage.true_position == place and not stage._sends_checksums
+        assert set(stage.received.split()) <= {b"?", b"/get", b"system.serial"}
+        with registry.open_device("stages", "zaber", found.options) as opened:
+            assert opened.identity.serial == "12345"
+            with pytest.raises(Busy):
+                discovery.ask_port(port)
+
+
+def test_a_grbl_machine_reports_its_state():
+    with NotedGrbl() as stage:
+        place = stage.true_position
+        (found,) = discovery.ask_port(str(stage.port))
+        assert found.driver == "grbl" and ("Grbl" in found.about or "state" in found.about)
+        assert stage.true_position == place
+        assert set(stage.received.split()) <= {b"?"}
+
+
+def test_nothing_and_no_port(tmp_path):
+    with pytest.raises(NotFound):
+        discovery.ask_port(str(tmp_path / "none"))
+    assert "no serial port that works" in one_line(call("doctor", "--ask", tmp_path / "none"))
+
+
+def test_a_driver_of_another_package_finds_its_own(monkeypatch):
+    class Eye(Device):
+        @classmethod
+        def connected(cls):
+            return [Connected("camera", "eye", {"serial": "7"}, "Elsewhere Eye")]
+
+    monkeypatch.setattr(discovery, "drivers", lambda kind: {"eye": ""} if kind == "cameras" else {})
+    monkeypatch.setattr(discovery, "driver", lambda kind, name: Eye)
+    ports = [SimpleNamespace(device="/dev/ttyUSB0", description="USB serial")]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
+    result = call("doctor", "--devices")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert "camera eye {serial: 7}: Elsewhere Eye" in lines
+    assert "serial port {port: /dev/ttyUSB0}: USB serial" in lines
