@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 
 import thincam_jax as tc
 from thincam_jax import design
-from thincam_jax.measured.calibration import fit_psf
 from thincam_jax.reconstruction import phase_pairs
 from thincam_jax.units import nm, um
 
@@ -55,31 +54,7 @@ def models():
 
 def calibration():
     """A noisy PSF, what is fitted to it, and what is left."""
-    sensor = tc.Sensor((192, 256), 22 * um)
-    true = tc.LenslessCamera(
-        tc.FresnelZoneAperture(12.3, 0.4, width=4.0, centre=(0.12, -0.2)), sensor, distance=6.62
-    )
-    light = {"wavelength": 500 * nm, "object_distance": 250.0}
-    exact = np.asarray(tc.psf(true, pixel_integration=True, **light))
-    noise = 0.05 * np.random.default_rng(0).normal(size=exact.shape)
-    measured = exact + noise
-    nominal = tc.LenslessCamera(tc.FresnelZoneAperture(12.0, width=4.0), sensor, distance=6.5)
-    fit = fit_psf(measured, nominal, **light)
-    told = {name: (float(v), float(fit.standard_errors[name])) for name, v in fit.values.items()}
-    print("true β 12.3 rad/mm², d 6.62 mm; fitted:", told, fit.status)
-    residual = np.asarray(fit.residual)
-    figure = Figure(figsize=(11, 3.2), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
-    images = {"measured": measured, "fitted": measured - residual, "measured − fitted": residual}
-    x, y = np.asarray(sensor.grid.x), np.asarray(sensor.grid.y)
-    for ax, (title, image) in zip(panels, images.items(), strict=True):
-        low, high = (-0.5, 0.5) if title == "measured − fitted" else (0, 1.2)
-        extent = (x[0], x[-1], y[-1], y[0])
-        shown = ax.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent)
-        ax.set(title=title, xlabel="x on the sensor (mm)")
-        figure.colorbar(shown, ax=ax, label="irradiance (open aperture = 1)", shrink=0.75)
-    panels[0].set_ylabel("y on the sensor (mm)")
-    return figure
+    return _by_script("calibrate_psf", "fit.png", "full")
 
 
 def _two_pitches():

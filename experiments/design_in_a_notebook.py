@@ -17,6 +17,7 @@ from thincam_jax import design
 from thincam_jax.reconstruction import phase_pairs
 from thincam_jax.units import deg, nm, um
 
+SMALL = os.environ.get("THINCAM_SIZE") == "small"
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "design_in_a_notebook"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
@@ -30,7 +31,8 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 setup = design.Setup(20 * um, sensor_width=2.0, object_distance=100.0, object_width=60.0)
 base = design.shots((25.0, 21.0), 3.0, (0.0, 270 * deg), wavelength=500 * nm, width=2.0)
 betas = [design.Variable("beta", 12.0, 60.0, captures) for captures in ((0, 1), (2, 3))]
-space = design.DesignSpace(base, (*betas, design.Variable("distance", 2.0, 3.0, (0, 1, 2, 3))))
+distance = design.Variable("distance", 2.0, 3.0, (0, 1, 2, 3))
+space = design.DesignSpace(base, (betas[0], distance, betas[1]))
 problem = design.design_problem(design.BayesError(), space, setup, phase_pairs(2))
 
 # %%
@@ -39,23 +41,25 @@ problem = design.design_problem(design.BayesError(), space, setup, phase_pairs(2
 #
 # The tolerance of a number is the change that makes the expected error 1 % worse.
 
-best = design.find_designs(problem, design.SearchSettings(2, 32), key=jax.random.key(0)).found[0]
+settings = design.SearchSettings(1, 8) if SMALL else design.SearchSettings(2, 32)
+best = design.find_designs(problem, settings, key=jax.random.key(0)).found[0]
 tolerances = design.sensitivity_around(problem, best)
 print(tolerances)
 tc.plot.sensitivity(tolerances).savefig(FIGURES / "sensitivity.png")
 
 # %%
-# The objective over both β, the distance held
-# --------------------------------------------
+# The objective over β and the distance, the other β held
+# -------------------------------------------------------
 
-figure = design.landscape_around(problem, best.design).plot({"start": base, "found": best.design})
+landscape = design.landscape_around(problem, best.design, 21 if SMALL else 61)
+figure = landscape.plot({"start": base, "found": best.design})
 figure.savefig(FIGURES / "landscape.png")
 
 # %%
 # What thickness buys: the best design for each
 # ---------------------------------------------
 
-thin = {d: problem.with_thickness(d) for d in (2.0, 2.5, 3.0)}
-front = design.find_front(thin, design.SearchSettings(2, 32), key=jax.random.key(0))
+thin = {d: problem.with_thickness(d) for d in ((2.0, 3.0) if SMALL else (2.0, 2.5, 3.0))}
+front = design.find_front(thin, settings, key=jax.random.key(0))
 figure = tc.plot.front(front, "longest distance (mm)")
 figure.savefig(FIGURES / "front.png", dpi=110)

@@ -21,7 +21,6 @@ from thincam_jax import learn
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.units import nm, um
 
 PACKAGE = ROOT / "thincam_jax"
@@ -52,7 +51,7 @@ def test_start_page(capsys, monkeypatch, tmp_path):
     PIL.Image.fromarray(skimage.data.chelsea()).save("photo.jpg")
     cells = np.random.default_rng(0).integers(0, 2, (40, 40), dtype=np.uint8)
     PIL.Image.fromarray(np.kron(255 * cells, np.ones((10, 10), np.uint8))).save("mask.png")
-    with jax.enable_x64(False), pytest.warns(AccuracyWarning):
+    with jax.enable_x64(False):
         names = run_examples("docs/start.md")
     assert len(names["figure"].axes) == 3
     assert names["result"].image.shape == (3, 130, 196)

@@ -8,7 +8,10 @@ import subprocess
 import sys
 from importlib.metadata import version
 
+import numpy as np
 import pytest
+import tifffile
+from commands.study import tiny
 
 import thincam_jax as tc
 from helpers import ROOT
@@ -102,6 +105,29 @@ def test_help_is_a_page_of_names():
     listed = text.split("- cameras")[1].split("The names")[0]
     for name in re.findall(r"`([\w.]+)`", listed):
         assert operator.attrgetter(name)(tc) is not None
+
+
+@pytest.mark.thorough
+def test_the_core_runs_without_any_extra(tmp_path):
+    """A study from a file to its report, a TIFF, and the line that names the extra for another."""
+    extras = ("anywidget", "dask", "distributed", "imagecodecs", "pyarrow", "rawpy", "serial")
+    extras += ("starlette", "usb", "uvicorn", "zarr")
+    file, tiff = tiny.write(tmp_path), tmp_path / "a.tif"
+    tifffile.imwrite(tiff, np.ones((6, 8), np.uint8), compression="lzw")
+    modules = imported_by(
+        f"import sys; sys.modules |= dict.fromkeys({extras})\n"
+        + as_command(f"run {file} --out {tmp_path / 'out'}")
+        + f"""
+from thincam_jax.measured import CaptureFileError, read_image
+try:
+    read_image({str(tiff)!r})
+except CaptureFileError as error:
+    assert "pip install 'thincam_jax[codecs]'" in str(error), error
+else:
+    raise AssertionError("LZW was read")
+"""
+    )
+    assert (tmp_path / "out/report.html").exists() and "scipy" in modules
 
 
 @pytest.mark.thorough

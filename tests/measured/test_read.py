@@ -101,6 +101,15 @@ def test_a_jpeg_is_read_with_a_warning(tmp_path):
         read_image(tmp_path / "b.jpg")
 
 
+def test_colours_of_16_bit_in_png_need_more_decoders(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)  # as where it is not installed
+    grey, colour = counts(np.uint16), counts(np.uint16, 3)
+    (tmp_path / "a.png").write_bytes(png_encode(colour))
+    refused(tmp_path / "a.png", r"pip install 'thincam_jax\[codecs\]', or save it as TIFF without")
+    (tmp_path / "b.png").write_bytes(png_encode(grey))
+    same(read_image(tmp_path / "b.png"), grey, "png", 16)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
 @pytest.mark.parametrize("compression", [None, "lzw", "zlib"])

@@ -33,7 +33,9 @@ def test_images_are_compared_with_the_truth():
     figure = tc.plot.compare({"scene": IMAGE, "ridge": found}, truth="scene")
     titles = [ax.get_title() for ax in figure.axes]
     assert titles[0] == "scene" and titles[1].startswith("ridge, 2") and titles[1].endswith(" dB")
-    assert len(tc.plot.compare({"colour": np.stack([IMAGE] * 3)}).axes) == 1
+    for colours in (np.stack([IMAGE] * 3), np.stack([IMAGE] * 3, axis=-1)):  # (y, x, 3): a file's
+        (panel,) = tc.plot.compare({"colour": colours}).axes
+        assert panel.images[0].get_array().shape == (9, 13, 3)
     for images, truth in (({}, None), ({"a": IMAGE}, "b"), ({"a": IMAGE, "b": IMAGE[1:]}, "a")):
         with pytest.raises(ValueError, match="give (images by name|the truth on the same pixels)"):
             tc.plot.compare(images, truth=truth)
@@ -80,11 +82,13 @@ def test_a_reconstruction_has_axes_in_mm_on_the_object():
     assert not figure.axes[1].get_xticks().size
 
 
-def test_a_notebook_shows_a_figure_once():
-    figure = tc.plot.capture(IMAGE, 0.02)
-    assert figure._ipython_display_() is None  # pyplot shows it at the end of the cell
+def test_a_notebook_shows_a_figure_once(monkeypatch):
+    """Whether IPython shows it as a value or at the end of a cell, it is not open afterwards."""
     from matplotlib import pyplot
 
-    pyplot.close(figure)
-    with pytest.raises(NotImplementedError):  # it is shown as the value of a later cell
+    monkeypatch.setattr(matplotlib, "get_backend", lambda: "inline")
+    figure = tc.plot.capture(IMAGE, 0.02)
+    with pytest.raises(NotImplementedError):
         figure._ipython_display_()
+    assert not pyplot.get_fignums()
+    assert figure._repr_png_()[:4] == b"\x89PNG"

@@ -33,6 +33,17 @@ class CaptureStoreError(MeasurementError):
     """A store of captures that cannot be used; one line says which frames and what to do."""
 
 
+def zarr_library() -> Any:
+    """Zarr, which takes a second to import."""
+    try:
+        import zarr.codecs
+    except ImportError:
+        raise CaptureStoreError(
+            "stores of frames and matrices need Zarr: pip install 'thincam_jax[stores]'"
+        ) from None
+    return zarr
+
+
 @contextlib.contextmanager
 def opened(
     path: str | Path, kinds: Sequence[str], told: tuple[str, str], mode: str = "r"
@@ -44,14 +55,13 @@ def opened(
     **Errors**: CaptureStoreError, one line, where it is of none of the `kinds` or of another
     version, or where the block finds something missing or wrong.
     """
-    import zarr  # a second
-
+    zarr = zarr_library()
     try:
         for pattern in ("zarr.json", "*/zarr.json", "digests/c/*", "matrix/c/*/*"):
             for file in Path(path).glob(pattern):
                 if not file.is_file() or file.stat().st_size > _DESCRIBED:
                     raise ValueError(f"{file} is a device, a pipe or too large")
-        group: Any = zarr.open_group(path, mode=mode, zarr_format=3)  # pyright: ignore[reportArgumentType]
+        group: Any = zarr.open_group(path, mode=mode, zarr_format=3)
         attributes: dict[str, Any] = dict(group.attrs)
         kind, version = attributes["kind"], attributes["version"]
         if kind not in kinds or version != VERSION:
@@ -108,9 +118,7 @@ class CaptureStore:
 
         - `together`: frames of a chunk. With 1 a chunk is a whole frame, with more it is some rows.
         """
-        import zarr
-        from zarr.codecs import Crc32cCodec
-
+        zarr = zarr_library()
         row = together * shape[2] * np.dtype(dtype).itemsize
         rows = shape[1] if together == 1 else min(shape[1], max(1, _CHUNK // row))
         with writing(path):
@@ -120,7 +128,7 @@ class CaptureStore:
                 shape=shape,
                 dtype=dtype,
                 chunks=(together, rows, shape[2]),
-                compressors=[Crc32cCodec()],
+                compressors=[zarr.codecs.Crc32cCodec()],
                 dimension_names=("frame", "y", "x"),
             )
             digests = group.create_array("digests", shape=shape[:1], dtype="uint64")

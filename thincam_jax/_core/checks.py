@@ -243,9 +243,14 @@ def pixel_pitch(name: str, value: Any) -> Checked:
     return _require(array, lambda p: (p >= _SMALLEST_PITCH) & (p <= _LARGEST_PITCH), message)
 
 
+def colours_last(shape: tuple[int, ...]) -> bool:
+    """Whether images are (…, y, x, 3) as in files, or (…, y, x, 4) with alpha."""
+    return len(shape) >= 3 and shape[-1] in (3, 4) and min(shape[-3:-1]) > 4
+
+
 def channels_first(name: str, shape: tuple[int, ...]) -> None:
     """Refuses (…, y, x, channel), whose columns would be taken for images."""
-    if len(shape) >= 3 and shape[-1] in (3, 4) and min(shape[-3:-1]) > 4:
+    if colours_last(shape):
         raise ValueError(
             f"{name} has shape {shape}, the colours last; give (…, channel, y, x), such as "
             "numpy.moveaxis(image, -1, -3)"

@@ -29,6 +29,8 @@ OPTIONAL = {
     "dask": "sweeps on other machines (thincam sweep --scheduler)",
     "distributed": "sweeps on other machines (thincam sweep --scheduler)",
     "pyarrow": "sweeps (thincam sweep)",
+    "zarr": "stores of the rig and of matrices (thincam capture)",
+    "imagecodecs": "compressed TIFF, 16-bit colour PNG",
     "rawpy": "DNG and raw files of cameras",
 }
 

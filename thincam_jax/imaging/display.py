@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
+from thincam_jax._core import checks
+
 
 def eight_bit(
     linear: np.ndarray, gamma: float | int = 2.2, percentile: float | int = 99.9
@@ -27,9 +29,13 @@ def png_bytes(pixels: np.ndarray) -> bytes:
 def pictures(image: Any, *, planes: bool = False) -> list[np.ndarray]:
     """The images of (*batch, y, x), each (y, x) or, of three channels, (y, x, 3), colours last.
 
+    A photograph, (y, x, 3), is taken as it is.
+
     With `planes` the last batch axis counts planes, and is not the colour channel.
     """
     image = np.nan_to_num(np.asarray(image, dtype=float))
+    if not planes and image.ndim == 3 and checks.colours_last(image.shape):
+        return [image[..., :3]]
     if not planes and image.ndim > 2 and image.shape[-3] == 3:
         return list(np.moveaxis(image.reshape(-1, *image.shape[-3:]), 1, -1))
     return list(image.reshape(-1, *image.shape[-2:]))

@@ -22,7 +22,7 @@ def _photograph(given: Any) -> Any:
     if checks.is_traced(given) or isinstance(given, jax.Array):
         return given
     array = checks.numbers("image", given)
-    if array.ndim == 3 and array.shape[-1] in (3, 4) and min(array.shape[:2]) > 4:
+    if array.ndim == 3 and checks.colours_last(array.shape):
         array = np.moveaxis(array[..., :3], -1, 0)
     return array / np.iinfo(array.dtype).max if array.dtype.kind == "u" else array
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import imagecodecs
 import numpy as np
+import PIL.Image
 import tifffile
 from jaxtyping import Bool
 
@@ -174,9 +174,11 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
         raise CaptureFileError(f"{path}: {error}") from None
     except Exception as error:  # each decoder raises its own kind
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        advice = "the file is cut short, damaged or of a rare kind: copy it again or save it anew"
+        if "imagecodecs" in reason:
+            advice = "pip install 'thincam_jax[codecs]', or save it as TIFF without compression"
         raise CaptureFileError(
-            f"{path}: cannot be read as {kind.upper()} ({reason}); the file is cut short, damaged "
-            "or of a rare kind: copy it again or save it anew"
+            f"{path}: cannot be read as {kind.upper()} ({reason}); {advice}"
         ) from None
     if kind == "jpeg":
         warnings.warn(f"{path}: {_NONLINEAR}", NonlinearWarning, stacklevel=3)
@@ -237,8 +239,19 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
     if _PNG_END not in data:
         raise CaptureFileError("is cut short: the PNG's last chunks are missing")
     _refuse_bomb(rows * columns * _PNG_CHANNELS[colour] * depth // 8, len(data))
-    pixels = imagecodecs.png_decode(data)
+    if depth == 16 and colour:  # of which Pillow keeps 8 bits
+        import imagecodecs
+
+        pixels = imagecodecs.png_decode(data)
+    else:
+        pixels = _by_pillow(data).astype(f"uint{depth}", copy=False)
     return [_without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))], depth
+
+
+def _by_pillow(data: bytes) -> np.ndarray:
+    PIL.Image.open(io.BytesIO(data)).verify()  # a PNG's checksums
+    with PIL.Image.open(io.BytesIO(data)) as file:
+        return np.array(file)
 
 
 def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], int]:
@@ -257,7 +270,7 @@ def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], int]:
 
 
 def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], int]:
-    return [imagecodecs.jpeg8_decode(data)], 8
+    return [_by_pillow(data)], 8
 
 
 def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], int | None]:

@@ -13,15 +13,19 @@ from matplotlib.image import AxesImage
 class Figure(matplotlib.figure.Figure):
     """A figure of pyplot that a notebook shows once.
 
-    Jupyter shows the open figures of pyplot at the end of a cell, and the value of its last line
-    as well. While pyplot will show the figure, its value shows nothing.
+    Jupyter shows the value of a cell's last line, and then all figures that are open. So a figure
+    that is shown is open no longer.
     """
 
     def _ipython_display_(self) -> None:
         from matplotlib import pyplot
 
-        if not pyplot.fignum_exists(getattr(self, "number", -1)):
-            raise NotImplementedError  # IPython goes on to the usual picture of a figure
+        if "inline" in matplotlib.get_backend():
+            pyplot.close(self)
+        raise NotImplementedError  # IPython goes on to the picture
+
+    def _repr_png_(self) -> bytes:
+        return as_png(self)  # as long as IPython has not been told how pyplot's are drawn
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -36,8 +36,8 @@ def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
 
     Axes are in mm on the object where a reconstruction knows its pitch.
 
-    - `images`: by name, (y, x) or (3, y, x), or what `tc.reconstruct` returns. Of several in a
-      batch the first is shown.
+    - `images`: by name, (y, x), (3, y, x) or a photograph (y, x, 3), or what `tc.reconstruct`
+      returns. Of several in a batch the first is shown.
     - `truth`: the name of the reference; the others' PSNR is reported against it, after the best
       gain and offset.
 

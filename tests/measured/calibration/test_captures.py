@@ -1,5 +1,7 @@
 """A store of captures: written in any order, and refused where a frame is not what it says."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -106,3 +108,10 @@ def test_what_is_no_store_is_refused(tmp_path):
         open_captures(path)
     with pytest.raises(ValueError, match="bits = 24; give 1 to 16"):
         create_captures(tmp_path / "c.zarr", SERIES, SHAPE, bits=24)
+
+
+def test_stores_need_zarr(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)  # as where it is not installed
+    for use in (open_captures, lambda path: create_captures(path, SERIES, SHAPE)):
+        with pytest.raises(CaptureStoreError, match=r"pip install 'thincam_jax\[stores\]'"):
+            use(tmp_path / "a.zarr")

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from thincam_jax._core.capture_store import VERSION, opened, stored_array
+from thincam_jax._core.capture_store import VERSION, opened, stored_array, zarr_library
 from thincam_jax._core.files import writing
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import Matrix
@@ -64,9 +64,7 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
     path, series = Path(path), captures.series
     if path.exists():
         raise CaptureStoreError(f"{path} exists; give another name")
-    import zarr
-    from zarr.codecs import Crc32cCodec
-
+    zarr = zarr_library()
     count, cells = math.prod(captures.sensor_shape), series.cell_count
     with writing(path):
         group = zarr.create_group(path)
@@ -75,7 +73,7 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
             shape=(count, cells),
             dtype="float32",
             chunks=(min(count, max(1, _BLOCK // (4 * cells))), cells),
-            compressors=[Crc32cCodec()],
+            compressors=[zarr.codecs.Crc32cCodec()],
             config={"write_empty_chunks": True},
             dimension_names=("pixel", "cell"),
         )

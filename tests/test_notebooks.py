@@ -1,0 +1,61 @@
+"""Notebooks as users run them: no warning, and every figure once."""
+
+import re
+
+import numpy as np
+import PIL.Image
+import pytest
+import skimage.data
+
+from helpers import ROOT
+
+nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed")
+nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
+pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+pytestmark = pytest.mark.thorough
+
+
+def cells_of(script: str) -> list[str]:
+    """Code of a script of experiments/, divided at `# %%` as in the notebook to download."""
+    text = (ROOT / "experiments" / f"{script}.py").read_text("utf-8")
+    return re.split(r"^# %%.*\n(?:#.*\n)*", text, flags=re.MULTILINE)
+
+
+def pictures_of(cells: list[str], folder, monkeypatch) -> list[str]:
+    """PNG pictures that a notebook shows, of which nothing else is on stderr."""
+    for name in ("MPLBACKEND", "JAX_PLATFORMS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("THINCAM_SIZE", "small")
+    monkeypatch.setenv("THINCAM_FIGURES", str(folder))
+    monkeypatch.setenv("IPYTHONDIR", str(folder / "ipython"))
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
+    where = {"metadata": {"path": str(folder)}}
+    nbclient.NotebookClient(book, timeout=600, kernel_name="python3", resources=where).execute()
+    outputs = [output for cell in book.cells for output in cell.outputs]
+    assert not [o.text for o in outputs if o.get("name") == "stderr"]
+    return [o.data["image/png"] for o in outputs if "image/png" in o.get("data", {})]
+
+
+def test_first_image_with_an_own_mask_and_photograph(tmp_path, monkeypatch):
+    """The block of the Start page, of at most twelve lines."""
+    page = (ROOT / "docs/start.md").read_text("utf-8").split("## First image")[1]
+    block = page.split("```python\n")[1].split("```")[0]
+    assert len([line for line in block.splitlines() if line]) <= 12
+    PIL.Image.fromarray(skimage.data.chelsea()).save(tmp_path / "photo.jpg")
+    cells = np.random.default_rng(0).integers(0, 2, (40, 40), dtype=np.uint8)
+    mask = PIL.Image.fromarray(np.kron(255 * cells, np.ones((10, 10), np.uint8)))
+    mask.save(tmp_path / "mask.png")
+    assert mask.size == (400, 400)
+    assert len(pictures_of([f"{block}figure"], tmp_path, monkeypatch)) == 1
+
+
+@pytest.mark.parametrize("script", ["design_in_a_notebook", "real_capture"])
+def test_a_script_as_a_notebook(script, tmp_path, monkeypatch):
+    """A design by gradient with its landscape; a capture from files, the real one where it is."""
+    hand = ROOT.parent / "shared/data/diffusercam-hand"
+    if hand.exists():
+        monkeypatch.setenv("THINCAM_HAND", str(hand))
+    cells = cells_of(script)
+    shown = pictures_of(cells, tmp_path, monkeypatch)
+    assert len(shown) == len(set(shown)) == "".join(cells).count(".savefig(")
