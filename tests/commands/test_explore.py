@@ -1,65 +1,31 @@
 """`thincam explore`: its page reaches the camera, and nobody else does."""
 
 import json
-import os
-import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
-import urllib.error
-import urllib.request
 
 import pytest
+from commands.served import asked, served
 from commands.study import tiny
 from commands.test_cli import call, one_line
-
-from helpers import ROOT
 
 pytest.importorskip("starlette")
 
 
-def asked(port, path, *, token=None, body=None, **headers):
-    """Status and body of a request; `token` as the page's module sends it."""
-    if token:
-        headers["Authorization"] = f"Bearer {token}"
-    data = None if body is None else json.dumps(body).encode()
-    address = f"http://127.0.0.1:{port}{path}"
-    request = urllib.request.Request(address, data, headers)
-    try:
-        with urllib.request.urlopen(request, timeout=120) as answer:
-            return answer.status, answer.read()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read()
-
-
 @pytest.fixture(scope="module")
-def served(tmp_path_factory):
+def explored(tmp_path_factory):
     """A process that serves the tiny study: the process, its port and token."""
-    file = tiny.write(tmp_path_factory.mktemp("explore"))
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", "thincam_jax.commands.start", "explore", str(file)]
-    with subprocess.Popen(
-        [*command, "--no-browser", "--json"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": path},
-    ) as child:
-        assert child.stdout is not None
-        address = json.loads(child.stdout.readline())["address"]
-        port, token = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]+)", address).groups()
-        yield child, int(port), token
-        child.kill()
+    with served("explore", tiny.write(tmp_path_factory.mktemp("explore"))) as found:
+        yield found
 
 
 VALUES = {"values": {"beta": 22.0}, "rest": False}
 
 
 @pytest.mark.thorough
-def test_only_the_page_of_the_printed_address_is_answered(served):
-    _, port, token = served
+def test_only_the_page_of_the_printed_address_is_answered(explored):
+    _, port, token = explored
     assert len(token) >= 43  # 256 bits
     status, page = asked(port, f"/?token={token}")
     assert status == 200 and token.encode() in page and b'"beta"' in page
@@ -90,10 +56,10 @@ def test_only_the_page_of_the_printed_address_is_answered(served):
 
 
 @pytest.mark.thorough
-def test_a_browser_shows_the_last_value_of_a_drag(served, tmp_path):
+def test_a_browser_shows_the_last_value_of_a_drag(explored, tmp_path):
     chromium = shutil.which("chromium") or pytest.skip("chromium is not installed")
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    _, port, token = served
+    _, port, token = explored
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1100, "height": 900})
@@ -119,8 +85,8 @@ def test_a_browser_shows_the_last_value_of_a_drag(served, tmp_path):
 
 
 @pytest.mark.thorough
-def test_ctrl_c_frees_the_port(served):
-    child, port, _ = served
+def test_ctrl_c_frees_the_port(explored):
+    child, port, _ = explored
     child.send_signal(signal.SIGINT)
     _, told = child.communicate(timeout=60)
     assert (child.returncode, told) == (130, "thincam: interrupted\n")

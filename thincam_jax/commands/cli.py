@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from thincam_jax.commands import terminal
 from thincam_jax.commands.cache import cache_state, keep_programs
-from thincam_jax.commands.capture.command import capture, known_drivers
+from thincam_jax.commands.capture.command import capture, known_drivers, preview
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
 from thincam_jax.commands.kinds import init
@@ -24,8 +24,8 @@ from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import WRONG_INPUT, say, say_result, tell, told
 
 ORDER = (
-    *("init", "explain", "explore", "run", "capture", "reconstruct", "calibrate", "sweep"),
-    *("design", "train", "bench", "schema", "doctor"),
+    *("init", "explain", "explore", "run", "preview", "capture", "reconstruct", "calibrate"),
+    *("sweep", "design", "train", "bench", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -134,6 +134,7 @@ for group, command, *examples in (
     ),
     (app, design, "design design.yaml", "design design.yaml --out found"),
     (app, train, "train learned.yaml", "train learned.yaml --resume"),
+    (app, preview, "preview rig_virtual.yaml"),
     (app, capture, "capture rig_virtual.yaml", "capture rig.yaml --out frames.zarr --resume"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
 ):

@@ -8,6 +8,8 @@ import PIL.Image
 
 from thincam_jax._core import checks
 
+_QUALITY = 85  # of JPEG
+
 
 def eight_bit(
     linear: np.ndarray, gamma: float | int = 2.2, percentile: float | int = 99.9
@@ -23,6 +25,13 @@ def png_bytes(pixels: np.ndarray) -> bytes:
     """A PNG file of 8-bit grey (y, x) or RGB (y, x, 3)."""
     buffer = io.BytesIO()
     PIL.Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def jpeg_bytes(pixels: np.ndarray) -> bytes:
+    """A JPEG file of the same: smaller, and a few levels off."""
+    buffer = io.BytesIO()
+    PIL.Image.fromarray(pixels).save(buffer, format="JPEG", quality=_QUALITY)
     return buffer.getvalue()
 
 

@@ -1,4 +1,4 @@
-// Controls and pictures of an explorer, in a notebook and on the page of `thincam explore`.
+// Controls and pictures, in a notebook and on the pages of `thincam explore` and `thincam preview`.
 // `request(values, rest)` resolves to a header and the pictures, as `View.message` makes them.
 
 const STYLE = `
@@ -32,8 +32,9 @@ function digits(value) {
 
 // At most two requests on their way; of those that wait only the newest is sent. At rest, a moment
 // after the last move, one with all pictures follows.
-function scheduler(request, show) {
-  let flying = 0, waiting = null, pause = null, sent = 0, shown = 0;
+// What is live is asked for again as soon as an answer is there.
+function scheduler(request, show, live) {
+  let flying = 0, waiting = null, pause = null, sent = 0, shown = 0, latest = null;
   async function send(values, rest) {
     const number = ++sent;
     flying += 1;
@@ -43,12 +44,17 @@ function scheduler(request, show) {
         shown = number;
         show(...answer);
       }
+    } catch (error) {
+      live = false;
+      show({ names: [], transfer: [], lines: [error.message], values: {} }, []);
     } finally {
       flying -= 1;
       if (waiting) {
         const next = waiting;
         waiting = null;
         send(...next);
+      } else if (live && !flying) {
+        send(latest, false);
       }
     }
   }
@@ -56,10 +62,11 @@ function scheduler(request, show) {
     if (flying < 2) send(values, rest);
     else waiting = [values, rest];
   }
-  return (values) => {
-    ask({ ...values }, false);
+  return (values, keep = false) => {
+    latest = { ...values };
+    ask(latest, keep);
     clearTimeout(pause);
-    pause = setTimeout(() => ask({ ...values }, true), 250);
+    if (!live) pause = setTimeout(() => ask(latest, true), 250);
   };
 }
 
@@ -103,14 +110,14 @@ function draw(canvas, header) {
   });
 }
 
-export function mount(root, controls, request) {
+export function mount(root, controls, request, captions = null, live = false) {
   const place = element("div", root, { className: "tc-explorer" });
   element("style", place, { textContent: STYLE });
   const knobs = element("div", place, { className: "tc-controls" });
   const pictures = element("div", place, { className: "tc-pictures" });
   const lines = element("p", place, { className: "tc-lines", ariaLive: "polite" });
   const values = {}, shown = {}, addresses = {};
-  for (const [name, caption] of Object.entries(CAPTIONS)) {
+  for (const [name, caption] of Object.entries(captions ?? CAPTIONS)) {
     const figure = element("figure", pictures);
     shown[name] = element(name === "transfer" ? "canvas" : "img", figure, { alt: caption });
     element("figcaption", figure, { textContent: caption });
@@ -121,13 +128,15 @@ export function mount(root, controls, request) {
       addresses[name] = URL.createObjectURL(blobs[index]);
       shown[name].src = addresses[name];
     });
-    for (const name of ["capture", "image"]) {
-      shown[name].classList.toggle("tc-stale", !header.names.includes(name));
+    for (const name of Object.keys(shown)) {
+      const stale = !header.names.includes(name) && !["psf", "transfer"].includes(name);
+      shown[name].classList.toggle("tc-stale", stale);
     }
-    draw(shown.transfer, header);
+    if (header.transfer.length) draw(shown.transfer, header);
     lines.textContent = header.lines.join(" ");
     place.dataset.values = JSON.stringify(header.values);
-  });
+    place.dataset.count = Number(place.dataset.count ?? 0) + 1;
+  }, live);
   for (const control of controls) {
     const { name, label, unit, low, high, value } = control;
     values[name] = value;
@@ -141,6 +150,11 @@ export function mount(root, controls, request) {
       told.textContent = `${digits(values[name])} ${unit}`;
       turn(values);
     });
+  }
+  if (live) {
+    const keep = element("button", knobs, { textContent: "keep this frame (k)" });
+    keep.addEventListener("click", () => turn(values, true));
+    document.addEventListener("keydown", ({ key }) => key === "k" && turn(values, true));
   }
   turn(values);
   return place;

@@ -1,7 +1,6 @@
 """A camera whose numbers are turned by hand: the controls, and the pictures of each setting."""
 
 import dataclasses
-import io
 import json
 import math
 import operator
@@ -12,13 +11,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import PIL.Image
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
+from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import Quantity
-from thincam_jax.imaging.display import png_bytes
+from thincam_jax.imaging.display import jpeg_bytes, png_bytes
 from thincam_jax.imaging.metrics import align, cut_off, first_common_zero, low_frequency_value, psnr
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import GaussianNoise
@@ -37,26 +36,7 @@ _FILLED = 0.7
 # How far a control goes below and above its value.
 _LOWEST, _HIGHEST = 0.25, 2.5
 _SNR_DB, _TOLERANCE = 30.0, 1e-2
-_QUALITY = 85  # of JPEG, while a control is moved
 _MOST_PIXELS = 2048  # of a sensor's side
-
-
-@dataclass(frozen=True)
-class Control:
-    """A number that is turned.
-
-    - `name`: of the field of the mask or camera, or of the light.
-    - `label`, `unit`: as shown. `scale`: mm, or other units of the package, of one shown unit.
-    - `low`, `high`, `value`: in the shown unit.
-    """
-
-    name: str
-    label: str
-    unit: str
-    low: float
-    high: float
-    value: float
-    scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +89,8 @@ class Explorer:
     - `wavelength`, `object_distance`: mm, where the controls begin.
     """
 
+    captions, live = None, False  # see `Controlled`
+
     def __init__(
         self,
         camera: LenslessCamera,
@@ -147,13 +129,7 @@ class Explorer:
 
     def turn(self, values: dict[str, float]) -> None:
         """Set controls, each within its range; ValueError names one that does not exist."""
-        known = {control.name: control for control in self.controls}
-        for name, value in values.items():
-            checks.choice("control", name, known)
-            control = known[name]
-            self.values[name] = float(
-                checks.between(name, value, control.unit, control.low, control.high)
-            )
+        self.values |= turned(self.controls, values)
 
     def view(self, *, rest: bool = True) -> View:
         """The pictures of the setting; those that take long only at rest."""
@@ -296,6 +272,4 @@ def _file(image: np.ndarray, rest: bool) -> bytes:
         image = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
     if rest:
         return png_bytes(image)
-    stream = io.BytesIO()
-    PIL.Image.fromarray(image).save(stream, format="JPEG", quality=_QUALITY)
-    return stream.getvalue()
+    return jpeg_bytes(image)

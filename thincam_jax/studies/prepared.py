@@ -1,7 +1,7 @@
 """Reconstruct captures that `measured.prepare` made of files, with a measured PSF."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -14,7 +14,7 @@ from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import window_shape
 from thincam_jax.lensless.psf import psf
-from thincam_jax.measured import Prepared, Raw
+from thincam_jax.measured import MeasurementError, Prepared, Raw
 from thincam_jax.reconstruction import (
     AbstractSolver,
     Cameras,
@@ -110,6 +110,32 @@ def _field(prepared: Prepared) -> tuple[int, int]:
     return rows, columns
 
 
+@dataclass(frozen=True)
+class PreparedFacts:
+    """How a prepared capture was reconstructed; `history` of the steps that were reported."""
+
+    method: str
+    noise_standard_deviation: float
+    field_shape: tuple[int, int]
+    iterations: int
+    status: str
+    relative_data_residual: float
+    history: list[dict[str, float]]
+    seconds: float
+
+
+def check_channels(prepared: Prepared, name: str) -> None:
+    """Refuse a channel in which nothing can be seen; `name`: of the capture, for messages.
+
+    **Errors**: MeasurementError, one line.
+    """
+    if not (prepared.valid & (prepared.capture > 0)).any(axis=(1, 2)).all():
+        raise MeasurementError(
+            f"{name}: has a channel without a trusted pixel that holds light; all others are "
+            "saturated or dead: give a larger saturation, or expose less"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class PreparedResult:
     """The reconstruction of a prepared capture, over all that sends light to the sensor."""
@@ -134,6 +160,21 @@ class PreparedResult:
         if isinstance(self.solver, AbstractRegularised):
             return self.recording.problem(tau=self.solver.tau, regulariser=self.solver.prior)
         return self.recording.problem(tau=2.0)
+
+    @property
+    def facts(self) -> "PreparedFacts":
+        """What was solved, and how it ended."""
+        found = self.found
+        return PreparedFacts(
+            found.method,
+            self.pixel_deviation,
+            self.problem.field_shape,
+            found.iterations,
+            found.status,
+            self.relative_residual,
+            [asdict(step) for step in found.history],
+            round(found.seconds, 3),
+        )
 
     @property
     def pixel_deviation(self) -> float:

@@ -8,7 +8,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,15 @@ from thincam_jax import waveguide as wg
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix, Sparse
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import calibration
-from thincam_jax.reconstruction import AbstractSolver, Reconstruction
+from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Wiener
 from thincam_jax.reconstruction.noise import estimate_noise
 from thincam_jax.studies.evaluate import reconstructor, rounded, sample
 from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
 from thincam_jax.studies.screen_calibration import diagonal_cells
 from thincam_jax.studies.simulate import noise_free
-from thincam_jax.studies.study import Study
+from thincam_jax.studies.study import Method, Study
 
 Pixels = tuple[slice, slice]
 FrameSolver = Callable[[Float[np.ndarray, "capture y x"]], Reconstruction]
@@ -67,6 +68,25 @@ def frame_solver(study: Study, width: float) -> FrameSolver:
         return solve(captures, estimate_noise(captures) ** 2)
 
     return solved
+
+
+def live_image(study: Study, width: float) -> Callable[[Float[np.ndarray, "y x"]], np.ndarray]:
+    """The function that makes an image, levels 0 to 1, of one frame of a study's first exposure.
+
+    By a Wiener filter, fast enough for a picture of what a camera sees now: without fringe scanning
+    a zone plate's background and twin image stay.
+    """
+    one = study.methods[0].exposures[0]
+    light = {"wavelength": one.wavelength, "width": one.width, "profile": one.profile}
+    first = Exposures(one.beta, one.distance, phase=one.phase, **light)
+    solve = frame_solver(replace(study, methods=(Method("live", first, Wiener()),)), width)
+
+    def levels(frame: Float[np.ndarray, "y x"]) -> np.ndarray:
+        image = np.squeeze(np.asarray(solve(frame[None]).image))
+        low, high = np.quantile(image, (0.002, 0.998))
+        return (image - low) / max(high - low, 1e-30)
+
+    return levels
 
 
 @dataclass(frozen=True, eq=False)

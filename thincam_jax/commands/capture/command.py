@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from thincam_jax.commands.explore import Browser, Port, serve_page
 from thincam_jax.commands.terminal import (
     ConfigFile,
     DryRun,
@@ -100,6 +101,35 @@ def capture(
         if not outcome.complete:
             raise KeyboardInterrupt
     say_result("store", store, f"{store}: {outcome.total} frames; next: thincam run {store}")
+
+
+def preview(
+    config: ConfigFile, set_: Overrides = None, port: Port = 0, browser: Browser = True
+) -> None:
+    """See what the camera of a rig sees, on a page in the browser: align, focus and expose.
+
+    Turn exposure, gain, the pattern and the stage; k keeps a frame in frames/. Ctrl-C ends it.
+    """
+    with told(lambda: "interrupted"):
+        from thincam_jax.commands.capture.run import build_study
+        from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.hardware.errors import HardwareError
+        from thincam_jax.hardware.preview import Preview
+        from thincam_jax.studies.rig import live_image
+
+        asked = load_experiment(config, tuple(set_ or ()), "capture")
+        plan = build_plan(asked)
+        try:
+            with opened(asked, plan) as rig:
+                image, region = None, asked.camera.region
+                if asked.optics is not None:
+                    shape = (region.height, region.width) if region else rig.camera.sensor_shape
+                    image = live_image(build_study(asked, shape), asked.optics.object.width)
+                timing = {"settle": asked.display.settle, "timeout": asked.acquisition.timeout}
+                serve_page(Preview(rig, plan, image=image, **timing), asked.name, port, browser)
+        except HardwareError as error:
+            tell(str(error))
+            raise typer.Exit(STOPPED) from None
 
 
 def reconstruct_store(store: Path, out: Path | None) -> Path:

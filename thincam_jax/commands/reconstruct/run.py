@@ -25,6 +25,7 @@ from thincam_jax.reconstruction.depth import depth_of_colours
 from thincam_jax.studies.prepared import (
     PixelNoise,
     PreparedResult,
+    check_channels,
     pixel_noise,
     prepared_recording,
     reconstruct_prepared,
@@ -244,28 +245,17 @@ def _reconstruct(
 
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
-    found, problem = done.found, done.problem
-    is_ridge, prior = recipe.is_ridge, problem.regulariser
-    has_tau = recipe.method not in ("ridge", "pnp")
-    assert isinstance(prior, TotalVariation)
-    variation = {"kind": prior.kind, "coupling": prior.coupling}
-    return {
-        "method": found.method,
+    problem, has_tau = done.problem, recipe.method not in ("ridge", "pnp")
+    assert isinstance(prior := problem.regulariser, TotalVariation)
+    return asdict(done.facts) | {
         "asked_for": recipe.method,
         "reason": choose_solver(done.recording)[1] if recipe.method == "auto" else "",
         "tau": recipe.relative_tau if has_tau else None,
         "absolute_tau": problem.absolute_tau if has_tau else None,
-        "ridge": recipe.relative_ridge if is_ridge else None,
-        "noise_standard_deviation": done.pixel_deviation,
-        "variation": variation if has_tau else None,
-        "nonnegative": problem.nonnegative and not is_ridge,
-        "field_shape": problem.field_shape,
+        "ridge": recipe.relative_ridge if recipe.is_ridge else None,
+        "variation": {"kind": prior.kind, "coupling": prior.coupling} if has_tau else None,
+        "nonnegative": problem.nonnegative and not recipe.is_ridge,
         "iterations_at_most": getattr(recipe.solver(1), "iterations", None),
-        "iterations": found.iterations,
-        "status": found.status,
-        "relative_data_residual": done.relative_residual,
-        "history": [asdict(step) for step in found.history],
-        "seconds": round(found.seconds, 3),
     }
 
 
@@ -326,11 +316,7 @@ def _check_channels(job: Job, ready: measured.Prepared, recipe: Recipe, output: 
         measured.to_display(
             np.ones((channels, 1, 1)), white_balance=output.white_balance, gamma=output.gamma
         )
-    if not (ready.valid & (ready.capture > 0)).any(axis=(1, 2)).all():
-        raise measured.MeasurementError(
-            f"{job.capture}: has a channel without a trusted pixel that holds light; all others "
-            "are saturated or dead: give a larger saturation, or expose less"
-        )
+    check_channels(ready, str(job.capture))
 
 
 def check_files(

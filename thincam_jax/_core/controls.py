@@ -1,0 +1,63 @@
+"""Numbers that are turned by hand, on a page or in a widget."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from thincam_jax._core import checks
+
+
+@dataclass(frozen=True)
+class Control:
+    """A number that is turned.
+
+    - `name`: of what it sets; `label`, `unit`: as shown.
+    - `low`, `high`, `value`: in the shown unit. `scale`: units of the package of one shown unit.
+    """
+
+    name: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    value: float
+    scale: float = 1.0
+
+
+@runtime_checkable
+class Message(Protocol):
+    """What a setting looks like."""
+
+    def message(self) -> tuple[str, list[bytes]]:
+        """A header as JSON, and the pictures in the order of its `names`."""
+        ...
+
+
+@runtime_checkable
+class Controlled(Protocol):
+    """What a page turns and shows.
+
+    - `captions`: of its pictures, by name, "transfer" that of a curve; None for those of a camera.
+    - `live`: whether it changes by itself, so that the page goes on asking.
+    """
+
+    controls: tuple[Control, ...]
+    captions: Mapping[str, str] | None
+    live: bool
+
+    def turn(self, values: dict[str, float]) -> None:
+        """Set controls; ValueError where one does not exist, or is out of its range."""
+
+    def view(self, *, rest: bool = True) -> Message:
+        """The pictures of the setting; at rest, or where a live one is to be kept, all of them."""
+        ...
+
+
+def turned(controls: tuple[Control, ...], values: Mapping[str, float]) -> dict[str, float]:
+    """Values checked, each within its control's range; ValueError names one that does not exist."""
+    known, found = {control.name: control for control in controls}, {}
+    for name, value in values.items():
+        checks.choice("control", name, known)
+        one = known[name]
+        found[name] = float(checks.between(name, value, one.unit, one.low, one.high))
+    return found

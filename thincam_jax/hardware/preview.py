@@ -1,0 +1,231 @@
+"""A rig at work, to align, focus and expose by: each newest frame, and settings that are turned."""
+
+import dataclasses
+import io
+import json
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+
+from thincam_jax._core.controls import Control, turned
+from thincam_jax._core.files import write_whole
+from thincam_jax.hardware.acquisition.plan import Plan
+from thincam_jax.hardware.acquisition.rig import Rig
+from thincam_jax.hardware.acquisition.taker import full_scale
+from thincam_jax.hardware.base import Frame
+from thincam_jax.hardware.errors import Disconnected, HardwareError
+from thincam_jax.imaging.display import jpeg_bytes
+
+_LONGEST = 900  # pixels of the longer side of a shown frame
+_BINS = 64  # of the histogram
+_SPREAD, _GAIN = 10.0, 24.0  # how far the exposure is turned, and the gain, dB
+_SATURATED = (255, 40, 40)  # the colour of full pixels
+
+
+@dataclass(frozen=True)
+class FrameNumbers:
+    """What a frame tells of exposure and focus.
+
+    - `brightest`: count that a thousandth of the pixels exceeds, over the largest that there is.
+    - `saturated`: share of full pixels. `focus`: mean squared Laplacian over the mean squared: it
+      is largest where detail is sharpest.
+    - `histogram`: pixels by count from 0 to full scale, over the most frequent.
+    """
+
+    brightest: float
+    saturated: float
+    focus: float
+    histogram: np.ndarray
+
+    @classmethod
+    def of(cls, frame: Frame) -> "FrameNumbers":
+        full, pixels = full_scale(frame), frame.pixels.astype(np.float32)
+        inner = pixels[1:-1, 1:-1]
+        around = pixels[:-2, 1:-1] + pixels[2:, 1:-1] + pixels[1:-1, :-2] + pixels[1:-1, 2:]
+        level = float(np.mean(pixels) ** 2) or 1.0
+        counts, _ = np.histogram(pixels, _BINS, (0, full + 1))
+        return cls(
+            float(np.quantile(pixels, 0.999)) / full,
+            float(np.mean(frame.pixels >= full)),
+            float(np.mean((around - 4 * inner) ** 2)) / level,
+            counts / counts.max(),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """A frame as a page shows it; see `Message`."""
+
+    pictures: dict[str, bytes]
+    values: dict[str, float]
+    lines: tuple[str, ...]
+    histogram: np.ndarray
+
+    def message(self) -> tuple[str, list[bytes]]:
+        header = {
+            "names": [*self.pictures],
+            "transfer": [round(float(n), 4) for n in self.histogram],
+            "step": 1 / _BINS,
+            "zero": None,
+            "cut_off": 0,
+            "lines": self.lines,
+            "values": self.values,
+        }
+        return json.dumps(header), [*self.pictures.values()]
+
+
+class Preview:
+    """The newest frame of a rig, whose settings are turned; see `Controlled`.
+
+    - `rig`: its devices, open. `plan`: whose patterns are shown, and whose first settings it begins
+      with.
+    - `settle`: s from showing a pattern to the frame. `timeout`: s, beyond the exposure.
+    - `image`: what is reconstructed of a frame (y, x) of the first pattern, as levels 0 to 1.
+    - `folder`: of the frames that are kept.
+
+    A device that fails is told of in a line; an unplugged camera is opened again.
+    """
+
+    captions = {
+        "frame": "frame, black to full scale; full pixels are red, the cross is the middle",
+        "transfer": "pixels by count, from 0 to full scale, over the most frequent",
+        "image": "reconstruction of the first pattern's frame",
+    }
+    live = True
+
+    def __init__(
+        self,
+        rig: Rig,
+        plan: Plan,
+        *,
+        settle: float = 0.0,
+        timeout: float = 2.0,
+        image: Callable[[np.ndarray], np.ndarray] | None = None,
+        folder: Path | None = None,
+    ):
+        self.rig, self.plan, self.settle, self.timeout = rig, plan, settle, timeout
+        self.image, self.folder = image, folder or Path("frames")
+        self.settings = plan.settings[0]
+        if image is None:
+            self.captions = {k: v for k, v in self.captions.items() if k != "image"}
+        exposure = 1000 * self.settings.exposure
+        controls = [
+            Control("exposure", "exposure", "ms", exposure / _SPREAD, _SPREAD * exposure, exposure),
+            Control("gain", "gain", "dB", 0.0, _GAIN, min(max(self.settings.gain, 0.0), _GAIN)),
+        ]
+        if len(plan.patterns) > 1:
+            most = float(len(plan.patterns) - 1)
+            controls.append(Control("pattern", "pattern", "", 0.0, most, 0.0))
+        if rig.stage is not None:
+            low, high = rig.stage.limits
+            place = min(max(rig.stage.position(), low), high)
+            controls.append(Control("position", "stage", "mm", low, high, place))
+        self.controls = tuple(controls)
+        self.values = {one.name: one.value for one in controls}
+        self._set: dict[str, Any] = {}  # what the devices have
+        self._best, self._seen = 0.0, time.monotonic()
+        self._rate = 0.0
+
+    def turn(self, values: dict[str, float]) -> None:
+        """Set controls, each within its range; ValueError names one that does not exist."""
+        self.values |= turned(self.controls, values)
+
+    def view(self, *, rest: bool = False) -> FrameView:
+        """The next frame; `rest` keeps it in the folder."""
+        try:
+            frame = self._frame()
+        except HardwareError as error:
+            if isinstance(error, Disconnected):
+                self._set.clear()
+                with suppress(HardwareError):
+                    self.rig.reopen("camera")
+            return FrameView({}, dict(self.values), (str(error),), np.zeros(0))
+        numbers = FrameNumbers.of(frame)
+        now = time.monotonic()
+        rate = 1 / max(now - self._seen, 1e-6)
+        self._seen, self._rate = now, rate if not self._rate else 0.8 * self._rate + 0.2 * rate
+        self._best = max(self._best, numbers.focus)
+        lines = [
+            f"{numbers.brightest:.0%} of full scale, {numbers.saturated:.2%} of the pixels full.",
+            f"Focus {numbers.focus:.3g}, best {self._best:.3g}.",
+            f"Exposure {1000 * frame.exposure:.3g} ms, {self._rate:.1f} frames a second.",
+        ]
+        if rest:
+            lines.append(f"Kept as {self._keep(frame)}.")
+        pictures = {"frame": jpeg_bytes(_shown(frame))}
+        if self.image is not None and self._pattern == 0:
+            image = np.clip(self.image(frame.pixels.astype(np.float32)), 0, 1)
+            pictures["image"] = jpeg_bytes(np.round(255 * image).astype(np.uint8))
+        return FrameView(pictures, dict(self.values), tuple(lines), numbers.histogram)
+
+    @property
+    def _pattern(self) -> int:
+        return round(self.values.get("pattern", 0.0))
+
+    def _frame(self) -> Frame:
+        """With the devices set to the controls; only what has changed is set."""
+        rig, values = self.rig, self.values
+        if rig.stage is not None and self._set.get("position") != values["position"]:
+            if self._set:  # it stays where it is until it is turned
+                rig.stage.move_to(values["position"])
+            self._set["position"] = values["position"]
+        if self._set.get("pattern") != self._pattern:
+            rig.display.show(rig.render(self.plan.patterns[self._pattern]))
+            self._set["pattern"] = self._pattern
+            time.sleep(self.settle)
+        asked = dataclasses.replace(
+            self.settings, exposure=values["exposure"] / 1000, gain=values["gain"]
+        )
+        if self._set.get("settings") != asked:
+            rig.camera.configure(asked)
+            self._set["settings"] = asked
+        rig.camera.flush()
+        frame = rig.camera.trigger_and_grab(self.timeout)
+        return dataclasses.replace(frame, pixels=np.array(frame.pixels))
+
+    def _keep(self, frame: Frame) -> Path:
+        """A TIFF of the counts, with where they come from as its description."""
+        when = datetime.now(UTC)
+        known = {
+            "time": when.isoformat(),
+            "devices": {role: str(one) for role, one in self.rig.identities().items()},
+            "settings": dataclasses.asdict(self._set["settings"]),
+            "pattern": self.plan.patterns[self._pattern].label,
+            "position_mm": self.values.get("position"),
+            "number": int(frame.number),
+            "bits": frame.bit_depth,
+        }
+        content = io.BytesIO()
+        tifffile.imwrite(content, frame.pixels, description=json.dumps(known))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{when:%Y%m%d-%H%M%S}-{frame.number}.tif"
+        write_whole(path, content.getvalue())
+        return path
+
+
+def _shown(frame: Frame) -> np.ndarray:
+    """8 bits, RGB, at most some 900 pixels a side, with full pixels in red and a cross."""
+    full = full_scale(frame)
+    step = max(1, math.ceil(max(frame.pixels.shape) / _LONGEST))
+    pixels = frame.pixels[::step, ::step]
+    # Where any of a block is full, it is shown.
+    blocks = np.maximum.reduceat(
+        np.maximum.reduceat(frame.pixels, np.arange(0, frame.pixels.shape[0], step), axis=0),
+        np.arange(0, frame.pixels.shape[1], step),
+        axis=1,
+    )
+    grey = (pixels.astype(np.float32) * (255 / full)).astype(np.uint8)
+    picture = np.repeat(grey[..., None], 3, axis=-1)
+    rows, columns = grey.shape
+    picture[rows // 2] ^= 96
+    picture[:, columns // 2] ^= 96
+    picture[blocks >= full] = _SATURATED
+    return picture
