@@ -1,4 +1,4 @@
-"""The preview of a rig: what is set, what is told of a frame, what is kept, and devices that fail."""
+"""The preview of a rig: what is set, what a frame tells, what is kept, devices that fail."""
 
 import io
 import json

@@ -225,7 +225,7 @@ def _shown(frame: Frame) -> np.ndarray:
     grey = (pixels.astype(np.float32) * (255 / full)).astype(np.uint8)
     picture = np.repeat(grey[..., None], 3, axis=-1)
     rows, columns = grey.shape
-    picture[rows // 2] ^= 96
-    picture[:, columns // 2] ^= 96
+    for line in (picture[rows // 2], picture[:, columns // 2]):
+        line[:] = np.where(line < 128, 255, 0)
     picture[blocks >= full] = _SATURATED
     return picture

@@ -60,7 +60,11 @@ def test_a_browser_shows_frame_after_frame(previewed):
         faults = []
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.goto(f"http://127.0.0.1:{port}/?token={token}")
-        page.wait_for_function("+document.querySelector('.tc-explorer')?.dataset.count > 5")
+        place = page.locator(".tc-explorer[data-count]")
+        place.wait_for(timeout=60_000)
+        first = int(place.get_attribute("data-count"))
+        page.wait_for_timeout(3000)
+        assert int(place.get_attribute("data-count")) > first + 3
         page.locator("input[name=exposure]").evaluate(
             "(one) => { one.value = 4; one.dispatchEvent(new Event('input')); }"
         )
