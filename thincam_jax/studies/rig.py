@@ -25,7 +25,7 @@ from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import calibration
 from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Wiener
 from thincam_jax.reconstruction.noise import estimate_noise
-from thincam_jax.studies.evaluate import reconstructor, rounded, sample
+from thincam_jax.studies.evaluate import Reconstructor, reconstructor, rounded, sample
 from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
 from thincam_jax.studies.screen_calibration import diagonal_cells
 from thincam_jax.studies.simulate import noise_free
@@ -59,9 +59,7 @@ def frame_solver(study: Study, width: float) -> FrameSolver:
     - `width`: of the square object that the image covers, mm. The noise is estimated from the
       frames.
     """
-    method, distance = study.methods[0], study.object_distance
-    side = max(1, round(width * method.distance / distance / study.pitch))
-    solve = reconstructor(study, method, (side, side), distance)
+    solve = _solver_of(study, width)
 
     def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
         captures = jnp.asarray(frames[:, None], jnp.float32)
@@ -70,19 +68,31 @@ def frame_solver(study: Study, width: float) -> FrameSolver:
     return solved
 
 
+def _solver_of(study: Study, width: float) -> Reconstructor:
+    method, distance = study.methods[0], study.object_distance
+    side = max(1, round(width * method.distance / distance / study.pitch))
+    return reconstructor(study, method, (side, side), distance)
+
+
 def live_image(study: Study, width: float) -> Callable[[Float[np.ndarray, "y x"]], np.ndarray]:
     """The function that makes an image, levels 0 to 1, of one frame of a study's first exposure.
 
     By a Wiener filter, fast enough for a picture of what a camera sees now: without fringe scanning
-    a zone plate's background and twin image stay.
+    a zone plate's background and twin image stay. The noise is estimated anew where the light has
+    changed by a fifth.
     """
     one = study.methods[0].exposures[0]
     light = {"wavelength": one.wavelength, "width": one.width, "profile": one.profile}
     first = Exposures(one.beta, one.distance, phase=one.phase, **light)
-    solve = frame_solver(replace(study, methods=(Method("live", first, Wiener()),)), width)
+    solve = _solver_of(replace(study, methods=(Method("live", first, Wiener()),)), width)
+    level, variance = 0.0, jnp.zeros((1, 1))
 
     def levels(frame: Float[np.ndarray, "y x"]) -> np.ndarray:
-        image = np.squeeze(np.asarray(solve(frame[None]).image))
+        nonlocal level, variance
+        captures, now = jnp.asarray(frame[None, None], jnp.float32), float(frame.mean())
+        if abs(now - level) > 0.2 * level or not level:
+            level, variance = now, estimate_noise(captures) ** 2
+        image = np.squeeze(np.asarray(solve(captures, variance).image))
         low, high = np.quantile(image, (0.002, 0.998))
         return (image - low) / max(high - low, 1e-30)
 
