@@ -75,8 +75,8 @@ def test_accuracy_page(capsys):
     full = names["tc"].capture(names["small"], names["scene"])
     assert str(names["plan"]) in printed
     assert (
-        str(names["plan"]).splitlines()[2:5]
-        == re.findall(r"\n(depth planes.*\n.*\n.*)", page)[0].splitlines()
+        str(names["plan"]).splitlines()[2:6]
+        == re.findall(r"\n(field  .*\n.*\n.*\n.*)", page)[0].splitlines()
     )
     assert np.linalg.norm(names["image"] - full) < 1e-2 * np.linalg.norm(full)
 
