@@ -39,10 +39,8 @@ def check(
     - `capture_size`: the same for captures and reconstructions; None for the default.
     """
     if config.mask.pixel_pitch is not None:
-        raise ConfigError(
-            "mask.pixel_pitch: the benchmark compares models that have no display pixels; leave it "
-            "out of the file"
-        )
+        fault = "mask.pixel_pitch: the models compared have no display pixels"
+        raise ConfigError(f"{fault}; leave it out of the file")
     own = max(config.sensor.shape)
     of_captures = min(_CAPTURE_SIZE, own) if capture_size is None else capture_size
     try:
@@ -88,7 +86,7 @@ def _record(plan: AccuracyRun) -> dict[str, Any]:
         "captured": _numbers(plan.case.method.exposures[0]),
     }
     head = {"bench": "accuracy", "config": dump_config(config), "settings": settings}
-    return {**head, "machine": machine(), **found}
+    return head | {"machine": machine()} | found
 
 
 def _numbers(exposure: Exposure) -> dict[str, Any]:

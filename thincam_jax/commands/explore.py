@@ -3,6 +3,7 @@
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
 
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -18,16 +19,13 @@ def serve_page(shown: Any, title: str, port: int, browser: bool) -> None:
     from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.plot.page import serve
 
-    def announce(address: str) -> None:
-        say_result("address", address, f"{address}\nCtrl-C ends it.")
-
     try:
-        serve(shown, title, port, announce, browser)
+        serve(shown, title, port, partial(say_result, "address"), browser)
     except ImportError:
         raise ConfigError("pages need pip install 'thincam_jax[notebook]'") from None
     except OSError as error:
-        text = f"--port {port}: {error.strerror}; give another, or leave it out"
-        raise ConfigError(text) from None
+        fault = f"--port {port}: {error.strerror}"
+        raise ConfigError(f"{fault}; give another, or leave it out") from None
 
 
 def explore(
@@ -38,13 +36,13 @@ def explore(
     Only this machine reaches it, and only with the address that is printed. Ctrl-C ends it.
     """
     with told(lambda: "interrupted"):
-        from thincam_jax.commands.kinds import kind_of, load_study
+        from thincam_jax.commands.kinds import load_study
 
         asked = load_study(config, tuple(set_ or ()), "explore takes a study")
-        kind = kind_of(asked)
+        from thincam_jax.commands.study.build import build_study
         from thincam_jax.plot.explorer import Explorer
 
-        study = kind.part(kind.build)(asked)
+        study = build_study(asked)
         exposure = study.exposures[0]
         light = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
         explorer = Explorer(study.camera(exposure), **light)

@@ -161,16 +161,14 @@ class CaptureConfig(ExperimentConfig):
             if not self.targets:
                 raise FieldError("a virtual rig looks at one; give it", "targets")
             return
-        seen = virtual.screen
+        seen, place = virtual.screen, ("virtual", "screen")
         if seen is None:
-            message = f"a virtual rig for a plan of kind {plan.kind} needs it"
-            raise FieldError(message, "virtual", "screen")
+            raise FieldError(f"a virtual rig for a plan of kind {plan.kind} needs it", *place)
         if seen.hologram.colours is not None:
             message = f"a plan of kind {plan.kind} takes one colour; give wavelength instead"
-            raise FieldError(message, "virtual", "screen", "hologram", "colours")
+            raise FieldError(message, *place, "hologram", "colours")
         if seen.object.cells != plan.cells:
-            message = f"the plan shows {plan.cells}; give these"
-            raise FieldError(message, "virtual", "screen", "object", "cells")
+            raise FieldError(f"the plan shows {plan.cells}; give these", *place, "object", "cells")
         if seen.sensor.shape != virtual.sensor:
             message = f"virtual.sensor is {virtual.sensor}; give this"
-            raise FieldError(message, "virtual", "screen", "sensor", "shape")
+            raise FieldError(message, *place, "sensor", "shape")

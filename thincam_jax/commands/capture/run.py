@@ -147,9 +147,8 @@ class _CaptureRun(Run):
             found = reconstruct_pictures(shown, taken.frames, known, solvers)
         except ValueError as error:
             raise ConfigError(f"{config.place_of('matrix')}matrix: {error}") from None
-        self.folder.save_figure(
-            "images", draw_pictures(found.targets, found.captures, found.methods)
-        )
+        drawn = draw_pictures(found.targets, found.captures, found.methods)
+        self.folder.save_figure("images", drawn)
         for name, one in found.methods.items():
             for target, image in zip(found.targets, one.images, strict=True):
                 self.folder.save_image(f"{slug(target)}--{slug(name)}", image)
