@@ -1,7 +1,7 @@
 """Reconstruct captures that `measured.prepare` made of files, with a measured PSF."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -19,6 +19,7 @@ from thincam_jax.reconstruction import (
     AbstractSolver,
     Cameras,
     InverseProblem,
+    Progress,
     Psfs,
     Reconstruction,
     Recording,
@@ -120,7 +121,7 @@ class PreparedFacts:
     iterations: int
     status: str
     relative_data_residual: float
-    history: list[dict[str, float]]
+    history: tuple[Progress, ...]
     seconds: float
 
 
@@ -172,7 +173,7 @@ class PreparedResult:
             found.iterations,
             found.status,
             self.relative_residual,
-            [asdict(step) for step in found.history],
+            tuple(found.history),
             round(found.seconds, 3),
         )
 
