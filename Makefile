@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help run test test-all lint bench docs clean
+.PHONY: help run test test-all test-lowest lint bench docs clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-14s %s\n", $$1, $$2 }'
@@ -18,12 +18,23 @@ run: .venv/.installed-core ## Simulate and reconstruct the example experiment in
 	@$(BIN)/thincam run configs/fza_superresolution.yaml --out runs/fza_superresolution $(ARGS)
 
 # Python's compiled files are written whatever the shell says: the tests' take ten seconds a worker.
-test test-all: export PYTHONDONTWRITEBYTECODE =
+test test-all test-lowest: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.installed-test ## Run the tests, e.g. make test ARGS="tests/test_units.py -k angle".
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-all: .venv/.installed-test ## Run all tests, the thorough ones too (some 45 minutes).
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not full_size" $(ARGS)
+
+# The bounds of pyproject.toml as constraints; only other packages' deprecations are new then.
+test-lowest: .venv-lowest/.installed ## Run the tests with the oldest releases that are allowed.
+	@.venv-lowest/bin/python -m pytest -n 2 --dist loadfile -W ignore::DeprecationWarning $(ARGS)
+
+.venv-lowest/.installed: pyproject.toml
+	@$(PYTHON) -m venv .venv-lowest
+	@sed -n 's/^ *"\([^>"]*\)>=\([0-9.]*\).*/\1==\2/p' pyproject.toml | sort -u > .venv-lowest/constraints.txt
+	@.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check \
+	    -c .venv-lowest/constraints.txt -e '.[test]'
+	@touch $@
 
 lint: .venv/.installed-dev ## Check the style, the formatting and the types.
 	@$(BIN)/ruff check .

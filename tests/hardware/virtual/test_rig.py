@@ -8,7 +8,9 @@ import scipy
 
 import thincam_jax as tc
 from helpers import quick
-from thincam_jax.hardware import CameraSettings, Region
+from thincam_jax.hardware import CameraSettings, Region, registry
+from thincam_jax.hardware.errors import NotFound
+from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, cells_shown
@@ -153,3 +155,16 @@ def test_a_display_shows_late_where_that_fault_is_due():
 def test_a_pattern_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"\(4, 8\)"):
         rig().on_show(np.zeros((8, 4), np.uint8))
+
+
+def test_a_virtual_device_names_the_extra_that_is_missing(monkeypatch):
+    """A twin needs the libraries of the real device."""
+
+    def not_installed(name):
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(registry, "import_module", not_installed)
+    devices = VirtualDevices(VirtualRig.__new__(VirtualRig))
+    for connect, driver in ((devices.camera, "usb3_vision"), (devices.stage, "zaber")):
+        with pytest.raises(NotFound, match=r"pip install 'thincam-jax\[hardware\]'"):
+            connect(driver)

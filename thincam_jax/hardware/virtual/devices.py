@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any
 
+from thincam_jax.hardware import registry
 from thincam_jax.hardware.base import Camera, Display, Stage
 from thincam_jax.hardware.errors import NotFound
-from thincam_jax.hardware.registry import open_device
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.rig import VirtualRig
@@ -33,24 +33,28 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
 
     def camera(self, driver: str, options: Mapping[str, Any] | None = None) -> Camera:
         """Open the camera by usb3_vision or pylon; `options` except the camera's address."""
+        if driver not in ("usb3_vision", "pylon"):
+            raise _none_virtual("cameras", driver, "usb3_vision or pylon")
+        registry.driver("cameras", driver)  # says which library is missing before its twin needs it
         shape, faults = self.rig.optics.sensor_shape, self.faults["camera"]
         if driver == "pylon":
             from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
 
             return VirtualPylonCamera(self.rig.expose, shape, faults)
-        if driver != "usb3_vision":
-            raise _none_virtual("cameras", driver, "usb3_vision or pylon")
         from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 
         if "camera" not in self._there:
             self._there["camera"] = VirtualUsb3Vision(self.rig.expose, shape, faults=faults)
         backend = self._there["camera"]
-        return open_device("cameras", driver, {**(options or {}), "serial": "", "backend": backend})
+        return registry.open_device(
+            "cameras", driver, {**(options or {}), "serial": "", "backend": backend}
+        )
 
     def stage(self, driver: str, options: Mapping[str, Any] | None = None) -> Stage:
         """Open the stage by zaber or grbl; `options` except its port."""
         if driver not in ("zaber", "grbl"):
             raise _none_virtual("stages", driver, "zaber or grbl")
+        registry.driver("stages", driver)
         if "stage" not in self._there:
             from thincam_jax.hardware.virtual.grbl import VirtualGrbl
             from thincam_jax.hardware.virtual.zaber import VirtualZaber
@@ -59,7 +63,7 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
             device = kind(faults=self.faults["stage"], on_move=self.rig.on_move)
             self._there["stage"] = self._powered.enter_context(device)
         port = str(self._there["stage"].port)
-        return open_device("stages", driver, {**(options or {}), "port": port})
+        return registry.open_device("stages", driver, {**(options or {}), "port": port})
 
     def display(self, driver: str = "", options: Mapping[str, Any] | None = None) -> Display:
         """Open the display, whose patterns go to the rig, whatever the driver and its options."""
