@@ -34,9 +34,13 @@ def mask_of(name):
     return BLANK.mask(WAVELENGTH * (smooth > 0))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3))
 def psf(name, distance, wavelength, shape=SHAPE):
-    camera = tc.LenslessCamera(mask_of(name), tc.Sensor(shape, PITCH), distance)
+    return psf_of(mask_of(name), distance, wavelength, shape)  # a mask made inside would be traced
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def psf_of(mask, distance, wavelength, shape):
+    camera = tc.LenslessCamera(mask, tc.Sensor(shape, PITCH), distance)
     method = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(44, 52))
     return tc.psf(camera, wavelength=wavelength, model=method)
 

@@ -9,6 +9,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import count_traces
+from thincam_jax._core.precision import cast
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask
@@ -212,6 +213,18 @@ def test_single_precision(at):
         )
         for precision in ("float64", "float32")
     )
+    assert relative(np.asarray(single, float), exact) < 1e-4
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged):
+    camera, at = camera_of(), np.array([5.0, 7.0])
+    light = {"wavelength": np.float64(500 * nm), "object_distance": 100.0}
+    light |= {"pixel_integration": averaged}
+    exact = tc.psf(camera, at=at, **light)
+    with jax.numpy_dtype_promotion("standard"):  # as a user has it
+        single = tc.psf(cast(camera, "float32"), at=jnp.asarray(at), **light)
+    assert single.dtype == jnp.float32
     assert relative(np.asarray(single, float), exact) < 1e-4
 
 

@@ -74,7 +74,8 @@ def skew_image(
 
         def added(field, order):
             g, weight = order
-            return field + weight * _order(g, matrix, mask.extent, down, across), None
+            wave = weight * _order(g, matrix, mask.extent, down, across)
+            return field + wave.astype(field.dtype), None  # the point's own may be a wider one
 
         none = jnp.zeros(grid.shape, zones.coefficients.dtype)
         field, _ = jax.lax.scan(added, none, (curvatures, zones.coefficients))
@@ -82,7 +83,7 @@ def skew_image(
 
     if nodes is None:
         return irradiance(jnp.zeros(2, x.dtype))
-    return pixel_mean(irradiance, nodes, jnp.zeros(grid.shape, x.dtype))
+    return pixel_mean(irradiance, nodes, jnp.zeros(grid.shape, zones.beta.dtype))
 
 
 def _order(g, matrix, extent, y: Float[Array, " y"], x: Float[Array, " x"]):
