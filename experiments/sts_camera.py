@@ -182,9 +182,9 @@ figure.savefig(FIGURES / "images.png", dpi=110)
 # What this says
 # --------------
 #
-# With the right model 49 dB come back on both scenes. Forgetting the ghosts costs 20 dB and more, a
-# glass taken for 2 % thicker 8 dB and more: the plate has to be calibrated. (Fewer pixels at the same
-# 30 dB, as in the small size, leave less.)
+# With the right model 49 dB come back on both scenes. Forgetting the ghosts costs 20 dB and more,
+# a glass taken for 2 % thicker 8 dB and more: the plate has to be calibrated. (Fewer pixels at
+# the same 30 dB, as in the small size, leave less.)
 
 right, thick, single = models
 reaches, ghosts_cost, glass_costs = {"full": (48.5, 20, 8), "small": (33, 9, 2)}[SIZE]
