@@ -88,6 +88,7 @@ found = scipy.optimize.minimize(
     method="L-BFGS-B",
     bounds=[(40.0, 56.0), (math.log(0.01), math.log(20.0))],
     callback=lambda x: path.append(x),
+    options={"maxiter": 6 if SMALL else 30},
 )
 print(f"β {found.x[0]:.2f} rad/mm², τ {math.exp(found.x[1]):.2f}, {found.nfev} gradients")
 
@@ -95,8 +96,8 @@ print(f"β {found.x[0]:.2f} rad/mm², τ {math.exp(found.x[1]):.2f}, {found.nfev
 # The error over both, and the way down
 # -------------------------------------
 
-betas = np.linspace(44, 54, 6 if SMALL else 11)
-log_taus = np.linspace(math.log(0.02), math.log(10), 5 if SMALL else 9)
+betas = np.linspace(44, 54, 4 if SMALL else 11)
+log_taus = np.linspace(math.log(0.02), math.log(10), 3 if SMALL else 9)
 grid = [[float(error(np.float32([b, t]))) for b in betas] for t in log_taus]
 figure, ax = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
 shown = ax.contourf(betas, np.exp(log_taus), grid, 16, cmap="gray")
