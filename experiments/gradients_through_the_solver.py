@@ -33,7 +33,7 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 #
 # With the phases 0 and π. The mask was ordered with β = 46 rad/mm² and has 50.
 
-shape, pitch, width = ((24, 32), 50 * um, 0.84) if SMALL else ((96, 128), 25 * um, 1.2)
+shape, pitch, width = ((24, 32), 50 * um, 0.84) if SMALL else ((48, 64), 50 * um, 1.2)
 sensor, field = tc.Sensor(shape, pitch), (shape[0] // 2, shape[1] // 2)
 wide = tc.Grid((shape[0] + field[0] - 1, shape[1] + field[1] - 1), pitch)
 chart = jnp.asarray(siemens_star(field, 6 if SMALL else 12), jnp.float32)[
@@ -51,7 +51,7 @@ def problem_of(beta, tau, difference):
     return tc.Recording(difference[None], model, noise_variance=NOISE**2).problem(tau=tau)
 
 
-NOISE = 0.2 if SMALL else 0.8  # standard deviation, of the difference
+NOISE = 0.2  # standard deviation, of the difference
 clean = problem_of(TRUE, 1.0, jnp.zeros(shape)).operators[0](chart)[0]
 noise = np.random.default_rng(0).normal(0, NOISE, shape).astype(np.float32)
 seen = clean + noise
@@ -67,9 +67,7 @@ print(f"signal to noise {20 * math.log10(float(jnp.std(clean)) / NOISE):.1f} dB"
 
 def image_of(numbers):
     problem = problem_of(numbers[0], jnp.exp(numbers[1]), seen)
-    return tc.solve_fixed_point(
-        problem, 0 * chart, iterations=100 if SMALL else 300, tolerance=1e-6
-    ).image
+    return tc.solve_fixed_point(problem, 0 * chart, iterations=100, tolerance=1e-6).image
 
 
 @jax.jit
