@@ -183,7 +183,7 @@ def test_slopes():
     slope = jax.jit(jax.grad(value))
     for place in ((0.0, 0.0), (12.0, 21.0)):
         numbers = jnp.asarray([*place, 25.0, 6.5, 500 * nm, 100.0])
-        for k, step in enumerate((1e-4, 1e-4, 1e-5, 1e-6, 1e-10, 1e-4)):
+        for k, step in enumerate((1e-5, 1e-5, 1e-5, 1e-6, 1e-10, 1e-4)):
             moved = jnp.zeros(6).at[k].set(step)
             difference = (value(numbers + moved) - value(numbers - moved)) / (2 * step)
             np.testing.assert_allclose(slope(numbers)[k], difference, rtol=2e-4, atol=2e-6)
