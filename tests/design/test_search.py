@@ -159,7 +159,7 @@ def tiny(design, data):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"starts": 0}, "starts = 0; give at least 1"),
+        ({"starts": 0}, "starts = 0: give a whole number from 1 to 1000"),
         ({"samples": 0}, "samples = 0"),
         ({"steps": -1}, "steps = -1"),
     ],

@@ -1,43 +1,175 @@
-"""Kinds of the objects that a public function is given, checked by its annotations."""
+"""Kinds of the objects that a public function or class is given, checked by its annotations."""
 
 import functools
 import inspect
+import os
 import types
 import typing
-from collections.abc import Callable, Iterator
-from typing import Any, Literal, ParamSpec, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeVar
 
+import jax
 import numpy as np
+from jaxtyping import AbstractArray, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.quantity import quantities
 
-_Parameters = ParamSpec("_Parameters")
-_Result = TypeVar("_Result")
-_SIMPLE = {str: (str,), bool: (bool, np.bool_), int: (int, np.integer), type(None): (type(None),)}
-_WORDS = {str: "a text", bool: "True or False", int: "a whole number", type(None): "None"}
+_Public = TypeVar("_Public", bound=Callable[..., Any])
 
 
-def checked(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """The function, which raises TypeError in one line for an object of another kind.
+@dataclass(frozen=True)
+class _Kind:
+    """One of the kinds that an argument may be of; `words` say what to give."""
 
-    Checked are parameters annotated as classes of this package, texts, whole numbers and truth
-    values, and as unions of these; what is an array or a number is checked by its field.
+    holds: Callable[[Any], bool]
+    words: Callable[[], str]
+
+
+_Kinds = tuple[_Kind, ...]
+
+
+def checked(public: _Public) -> _Public:
+    """The function or class, which raises TypeError in one line for an argument of another kind.
+
+    Checked are parameters annotated as classes of this package, texts, numbers, truth values,
+    functions, paths, random keys and arrays (their dimensions, and that they hold finite numbers),
+    as tuples, sequences and mappings, as unions of these, and by a `Quantity`.
     """
-    signature = inspect.signature(function)
-    kinds = {name: _kinds(one.annotation) for name, one in signature.parameters.items()}
-    wanted = {name: kind for name, kind in kinds.items() if kind}
-    names = tuple(signature.parameters)
+    if isinstance(public, type):
+        setattr(public, "__init__", checked(public.__init__))  # noqa: B010
+        return typing.cast(_Public, public)
+    named = inspect.signature(public).parameters
+    names, ranges = tuple(named), quantities(public)
+    kinds = {name: _kinds(one.annotation) for name, one in named.items()}
+    # A quantity tells one number of another kind itself.
+    kinds = {name: kind for name, kind in kinds.items() if name not in ranges or ranges[name].many}
 
-    @functools.wraps(function)
-    def call(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+    @functools.wraps(public)
+    def call(*args: Any, **kwargs: Any) -> Any:
         for name, value in (*zip(names, args, strict=False), *kwargs.items()):
-            allowed = wanted.get(name)
-            if allowed and not _is_one(value, allowed):
-                words = " or ".join(_WORDS.get(kind) or _constructor(kind) for kind in allowed)
-                raise TypeError(f"{name} is {checks.shown(value)}; give {words}")
-        return function(*args, **kwargs)
+            allowed = kinds.get(name)
+            if allowed and not any(kind.holds(value) for kind in allowed):
+                raise TypeError(f"{name} is {checks.shown(value)}; give {_words(allowed)}")
+            if name in ranges:
+                with checks.on_host():
+                    ranges[name](value)
+        return public(*args, **kwargs)
 
-    return call
+    return typing.cast(_Public, call)
+
+
+def _words(kinds: _Kinds) -> str:
+    """What to give, each once."""
+    words = dict.fromkeys(kind.words() for kind in kinds)
+    if "a number" in words:
+        words.pop("a whole number", None)
+    return " or ".join(words)
+
+
+def _kinds(annotation: Any) -> _Kinds:
+    """The kinds that an annotation allows; none where it allows what is not checked here."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return _kinds(parts[0])
+    if origin in (typing.Union, types.UnionType):
+        each = [_kinds(part) for part in parts]
+        return sum(each, ()) if all(each) else ()
+    if origin in (tuple, Sequence, Iterable):
+        return (_several(parts, fixed=origin is tuple and parts[-1:] != (...,)),)
+    plain = _PLAIN.get(str if origin is Literal else origin or annotation)
+    if plain is not None or not isinstance(annotation, type):
+        return () if plain is None else (plain,)
+    if issubclass(annotation, AbstractArray):
+        return (_array(annotation),)
+    if annotation.__module__.startswith("thincam_jax"):
+        return (
+            _Kind(lambda value: isinstance(value, annotation), lambda: _constructor(annotation)),
+        )
+    return ()
+
+
+def _plain(words: str, *classes: Any) -> _Kind:
+    """Of these classes, and a truth value only where it is one of them."""
+
+    def holds(value: Any) -> bool:
+        is_truth = isinstance(value, bool | np.bool_)
+        return isinstance(value, classes) and (bool in classes or not is_truth)
+
+    return _Kind(holds, lambda: words)
+
+
+def _is_number(value: Any) -> bool:
+    """One real number, which may be traced, infinite or NaN."""
+    if not isinstance(value, int | float | np.ndarray | np.generic | jax.Array) or np.ndim(value):
+        return False
+    dtype = np.dtype(type(value)) if isinstance(value, int | float) else value.dtype
+    return dtype.kind in "fiu"
+
+
+_PLAIN: dict[Any, _Kind] = {
+    str: _plain("a text", str),
+    bool: _plain("True or False", bool, np.bool_),
+    int: _plain("a whole number", int, np.integer),
+    np.integer: _plain("a whole number", int, np.integer),
+    float: _Kind(_is_number, lambda: "a number"),
+    complex: _plain("a number", int, float, complex, np.number),
+    type(None): _plain("None", type(None)),
+    Mapping: _plain("a dictionary", Mapping),
+    dict: _plain("a dictionary", dict),
+    Callable: _Kind(callable, lambda: "a function"),
+    os.PathLike: _plain("a path", os.PathLike),
+    np.ndarray: _plain("an array", np.ndarray),
+}
+
+
+# Of random keys, new and old ones.
+_KEYS = {str(one.dtypes) for one in typing.get_args(PRNGKeyArray)}
+
+
+def _several(parts: tuple[Any, ...], *, fixed: bool) -> _Kind:
+    """A tuple of these kinds, or a sequence of one kind."""
+    each = [_kinds(part) for part in parts if part is not ...]
+
+    def holds(value: Any) -> bool:
+        is_array = isinstance(value, np.ndarray | jax.Array) and value.ndim
+        if not (is_array or isinstance(value, tuple | list)):
+            return False
+        if fixed and len(value) != len(each):
+            return False
+        kinds = each if fixed else each * len(value)
+        pairs = zip(value, kinds, strict=True)
+        return all(not kind or any(k.holds(one) for k in kind) for one, kind in pairs)
+
+    def words() -> str:
+        one = _words(sum(each, ())) or "an object"
+        return f"{f'{len(each)} values' if fixed else 'a sequence'}, each {one}"
+
+    return _Kind(holds, words)
+
+
+def _array(annotation: Any) -> _Kind:
+    """An array of as many dimensions, of finite numbers, or of truth values alone."""
+    dtypes, variadic = str(annotation.dtypes), annotation.index_variadic is not None
+    if dtypes in _KEYS:
+        return _Kind(lambda value: isinstance(value, annotation), lambda: "jax.random.key(seed)")
+    kinds = "b" if dtypes == str(("bool", "bool_")) else "fiub"
+    kinds += "c" if "complex" in dtypes or "Any" in dtypes else ""
+    least = len(annotation.dims) - variadic
+
+    def holds(value: Any) -> bool:
+        if not isinstance(value, np.ndarray | np.generic | jax.Array | int | float):
+            return False
+        array = np.asarray(value) if isinstance(value, int | float) else value
+        fits = array.ndim == least or (variadic and array.ndim > least)
+        if not fits or array.dtype.kind not in kinds:
+            return False
+        return checks.is_traced(array) or bool(np.isfinite(np.asarray(array)).all())
+
+    sides = f" ({', '.join(annotation.dim_str.split())})" if annotation.dims else ""
+    what = "truth values" if kinds == "b" else "finite numbers"
+    return _Kind(holds, lambda: f"an array{sides} of {what}" if sides else "a finite number")
 
 
 def _constructor(kind: type) -> str:
@@ -54,21 +186,3 @@ def _concrete(kind: type) -> Iterator[type]:
     for one in kind.__subclasses__():
         inner = tuple(_concrete(one))
         yield from inner or (one,)
-
-
-def _is_one(value: Any, allowed: tuple[type, ...]) -> bool:
-    if isinstance(value, bool | np.bool_) and bool not in allowed:
-        return False
-    return any(isinstance(value, _SIMPLE.get(kind, kind)) for kind in allowed)
-
-
-def _kinds(annotation: Any) -> tuple[type, ...]:
-    """The classes that an annotation allows; none where it allows what is not checked here."""
-    origin = typing.get_origin(annotation)
-    if origin in (typing.Union, types.UnionType):
-        parts = [_kinds(part) for part in typing.get_args(annotation)]
-        return tuple(dict.fromkeys(sum(parts, ()))) if all(parts) else ()
-    if origin is Literal:
-        return (str,)
-    own = isinstance(annotation, type) and annotation.__module__.startswith("thincam_jax")
-    return (annotation,) if own or annotation in _SIMPLE else ()

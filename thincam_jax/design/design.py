@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, unchecked
@@ -35,6 +36,7 @@ class Shot:
     exposure: float = 1.0
 
 
+@checked
 class Design(Module):
     """Captures with Fresnel zone apertures; every number may be searched for.
 
@@ -122,6 +124,7 @@ class Design(Module):
         ]
 
 
+@checked
 def shots(
     beta: Numbers | Sequence[float | int],
     distance: Numbers | Sequence[float | int],

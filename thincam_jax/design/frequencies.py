@@ -10,9 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.polynomial.legendre import leggauss
 
+from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 
 
+@checked
 class Quadrant(eqx.Module):
     r"""A square of frequencies ν_x, ν_y ≥ 0 that stands for the whole plane.
 
@@ -32,7 +35,7 @@ class Quadrant(eqx.Module):
         """`highest`: the band's end along an axis, cycles/rad; `count`: samples along it."""
         if count < 2:
             raise ValueError(f"count = {count}: give at least 2 frequencies")
-        highest = jnp.asarray(highest)
+        highest = checks.positive("highest", highest, "cycles/rad")
         self.axis = highest * jnp.linspace(0.0, 1.0, count, dtype=highest.dtype)
         along = jnp.full(count, 2.0, self.axis.dtype).at[0].set(1.0)
         self.weight = along[:, None] * along * (self.axis[1] - self.axis[0]) ** 2
@@ -54,6 +57,7 @@ class Quadrant(eqx.Module):
         return np.where(radius < 1, np.minimum(radius * rings, rings - 1), rings).astype(int)
 
 
+@checked
 class Polar(eqx.Module):
     r"""Radii and directions: a response whose fringes are rings needs few directions.
 
@@ -74,7 +78,7 @@ class Polar(eqx.Module):
             raise ValueError(
                 f"count = {count}, directions = {directions}: give at least 2 radii, 1 direction"
             )
-        highest = jnp.asarray(highest)
+        highest = checks.positive("highest", highest, "cycles/rad")
         nodes, weights = leggauss(directions)
         angle = np.pi / 8 * (nodes + 1)
         self.cosine = jnp.asarray(np.cos(angle), highest.dtype)

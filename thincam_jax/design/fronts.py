@@ -15,6 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.checks import Numbers
 from thincam_jax.design.design import Design, Shot
 from thincam_jax.design.objectives import ObjectiveData, ResolutionLimit, bayes_error, limit
 from thincam_jax.design.problem import DesignProblem
@@ -45,6 +48,7 @@ class FrontPoint(eqx.Module):
         return self.design.shots
 
 
+@checked
 def find_front(
     problems: Mapping[float, DesignProblem],
     settings: SearchSettings | None = None,
@@ -199,9 +203,8 @@ def _limit_and_error(
     return limit(known, data.frequencies), bayes_error(known)
 
 
-def non_dominated(
-    points: Float[np.ndarray, "point objective"], *, larger: Sequence[bool]
-) -> Bool[np.ndarray, " point"]:
+@checked
+def non_dominated(points: Numbers, *, larger: Sequence[bool]) -> Bool[np.ndarray, " point"]:
     """Which points lie on the Pareto front: no other one beats them in everything.
 
     A point is dominated by another one that is no worse in every objective and better in at least
@@ -215,6 +218,7 @@ def non_dominated(
 
     **Errors**: ValueError where `larger` has not one entry for each objective.
     """
+    points = checks.numbers("points", points)
     if points.ndim != 2 or points.shape[1] != len(larger):
         raise ValueError(
             f"points have shape {points.shape} and larger has {len(larger)} entries; give "

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem, Objective
@@ -83,6 +84,7 @@ class Landscape:
         return figure
 
 
+@checked
 def landscape_around(
     problem: DesignProblem, design: Design, count: int = 61, *, at_a_time: int = AT_A_TIME
 ) -> Landscape:
@@ -141,6 +143,7 @@ def drawn_variables(space: DesignSpace) -> tuple[Variable, ...]:
     return tuple(last[:2])
 
 
+@checked
 def evaluate_grid(
     objective: Objective, space: DesignSpace, data: Any, count: int, *, at_a_time: int = AT_A_TIME
 ) -> tuple[Float[Array, "point variable"], Float[Array, " point"]]:

@@ -28,6 +28,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
@@ -46,12 +47,14 @@ from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
 
 
+@checked
 def ring_levels(known: Channels, frequencies: Frequencies, rings: int) -> Float[Array, " ring"]:
     """10·log₁₀(1 + signal-to-noise ratio) of rings of equal width, dB, from zero frequency up."""
     # log1p keeps the digits of rings deep in the noise, and has a slope there.
     return _decibels(jnp.log1p(ring_means(known, frequencies, rings)))
 
 
+@checked
 def response_misfit(
     known: Channels, frequencies: Frequencies, target: Float[Array, " ring"]
 ) -> Float[Array, ""]:
@@ -68,6 +71,7 @@ def _decibels(natural: Float[Array, " ring"]) -> Float[Array, " ring"]:
     return natural * (10 / np.log(10.0))
 
 
+@checked
 class ResponseModel(eqx.Module):
     """From points of a space's unit cube to the levels that their designs give.
 
@@ -145,6 +149,7 @@ MATCHED = 1.0
 _WEIGHT = 100.0
 
 
+@checked
 @dataclass(frozen=True)
 class MatchSettings:
     """Length of a search for a response.
@@ -189,6 +194,7 @@ class Match(Module):
     failed: int
 
 
+@checked
 def match_response(
     model: ResponseModel,
     target: Numbers,

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
@@ -34,6 +35,7 @@ _LENGTH = quantity("mm", non_negative=True)
 _PART = quantity(check=functools.partial(checks.between, unit="a ratio", least=0.0, most=0.5))
 
 
+@checked
 class Channels(eqx.Module):
     """The sums of captures that a reconstruction starts from, at each frequency.
 
@@ -59,6 +61,7 @@ class Channels(eqx.Module):
         return self.density * self.information
 
 
+@checked
 def channels(
     design: Design,
     setup: Setup,
@@ -91,6 +94,7 @@ def _sums(
     return jnp.stack([sum(w * h for w, h in zip(row, responses, strict=True)) for row in matrix])  # pyright: ignore
 
 
+@checked
 def bayes_error(known: Channels) -> Float[Array, ""]:
     r"""Error of the best linear reconstruction, as a part of the scene's variance.
 
@@ -102,6 +106,7 @@ def bayes_error(known: Channels) -> Float[Array, ""]:
     return jnp.sum(error * known.weight) / jnp.sum(known.density * known.weight)
 
 
+@checked
 def mismatch_error(known: Channels, actual: Channels) -> Float[Array, ""]:
     r"""Error of that reconstruction where the camera differs from the assumed one.
 
@@ -135,6 +140,7 @@ def over_rings(
     return total / jax.ops.segment_sum(weight.ravel(), ring, rings + 1)[:-1]
 
 
+@checked
 def worst_ratio_db(
     known: Channels, frequencies: Frequencies, band: tuple[float, float], *, rings: int = 64
 ) -> Float[Array, ""]:
@@ -147,6 +153,7 @@ def worst_ratio_db(
     return -jax.nn.logsumexp(jnp.where(inside, -level, -jnp.inf))
 
 
+@checked
 def unevenness(
     known: Channels, frequencies: Frequencies, band: tuple[float, float], *, rings: int = 64
 ) -> Float[Array, ""]:
@@ -163,6 +170,7 @@ def unevenness(
     return jnp.sqrt(spread + jnp.finfo(level.dtype).eps)
 
 
+@checked
 def limit(
     known: Channels, frequencies: Frequencies, *, ratio: float = 1.0, rings: int = 64
 ) -> Float[Array, ""]:
@@ -190,6 +198,7 @@ def _tiny(known: Channels):
     return jnp.finfo(known.density.dtype).tiny
 
 
+@checked
 @dataclass(frozen=True)
 class Tolerances:
     """Standard deviations of the numbers that a reconstruction assumes; 0 is exact.
@@ -207,6 +216,7 @@ class Tolerances:
     tilt: Annotated[float, quantity("rad", non_negative=True)] = 0.0
 
 
+@checked
 def robust_error(
     design: Design,
     setup: Setup,
@@ -270,6 +280,7 @@ def _farther(design: Design, distance: Float[Array, " capture"]) -> Design:
     return eqx.tree_at(lambda d: d.distance, design, distance)
 
 
+@checked
 class ObjectiveData(eqx.Module):
     """Setup, synthesis and frequencies that an objective is evaluated with.
 
@@ -354,6 +365,7 @@ class BayesError(_RelativeError):
         return bayes_error(data.channels(design))
 
 
+@checked
 @dataclass(frozen=True)
 class RobustError(_RelativeError):
     """`robust_error` with these tolerances."""
@@ -368,6 +380,7 @@ class RobustError(_RelativeError):
         return robust_error(design, *given, self.tolerances, how=self.how)
 
 
+@checked
 @dataclass(frozen=True)
 class WorstRatio(_OfBand):
     """`worst_ratio_db` of a band."""
@@ -381,6 +394,7 @@ class WorstRatio(_OfBand):
         return worst_ratio_db(data.channels(design), data.frequencies, self.band)
 
 
+@checked
 @dataclass(frozen=True)
 class Unevenness(_OfBand):
     """`unevenness` of a band."""

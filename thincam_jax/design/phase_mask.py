@@ -25,6 +25,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
@@ -62,6 +63,7 @@ _MOST_SAMPLES = 2048
 MaskObjective = Callable[[PhaseMask, Any, PRNGKeyArray], Float[Array, ""]]
 
 
+@checked
 @dataclass(frozen=True)
 class HeightLimits:
     """Heights that can be made. The smallest feature is a cell of the mask.
@@ -94,12 +96,14 @@ class HeightLimits:
         return inside + drawn * jax.lax.stop_gradient(jnp.round(inside / step) * step - inside)
 
 
+@checked
 def one_turn(blank: MaskBlank, wavelength: Number, levels: int | None = None) -> HeightLimits:
     """Limits that hold every phase of one wavelength: λ/(n − 1), less the last of even levels."""
     limits = HeightLimits(float(blank.wrap_height(wavelength)), levels).checked()
     return limits if levels is None else replace(limits, highest=limits.highest * (1 - 1 / levels))
 
 
+@checked
 def mask_of_phase(
     phase: Float[Array, "y x"], blank: MaskBlank, wavelength: Number, limits: HeightLimits
 ) -> PhaseMask:
@@ -115,6 +119,7 @@ def mask_of_phase(
     return blank.mask(limits.nearest(jnp.where(turn - height < over, 0.0, height)))
 
 
+@checked
 def contour_mask(
     key: Key, blank: MaskBlank, path: Path, *, feature: Number, line_width: Number
 ) -> PhaseMask:
@@ -138,6 +143,7 @@ def contour_mask(
     return mask_of_phase(found.phase, blank, path.wavelength, one_turn(blank, path.wavelength))
 
 
+@checked
 class MaskSetting(eqx.Module):
     """Where a mask is designed: its sensor, and the light that it meets.
 
@@ -339,6 +345,7 @@ class Refined(Module):
     skipped: int
 
 
+@checked
 def refine_mask(
     objective: MaskObjective,
     mask: PhaseMask,

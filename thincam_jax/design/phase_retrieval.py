@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
@@ -34,6 +35,7 @@ class Retrieval(Module):
     error: Float[Array, " step"]
 
 
+@checked
 def retrieve_phase(
     target: Float[Array, "y x"],
     grid: Grid,
@@ -76,6 +78,7 @@ def retrieve_phase(
     return Retrieval(*_to_and_fro(target, grid, path, cells, key, steps))
 
 
+@checked
 def match_error(psf: Float[Array, "y x"], target: Float[Array, "y x"]) -> Float[Array, ""]:
     """Difference of two PSFs in shape: 1 − ⟨h, T⟩²/(‖h‖²‖T‖²), 0 where one is a multiple."""
     both = jnp.sum(psf * target) ** 2
@@ -113,6 +116,7 @@ def _to_and_fro(target, grid: Grid, path: Path, cells: tuple[int, int], key, ste
 _LEVELS = (-0.12, 0.12)
 
 
+@checked
 def contour_target(
     key: PRNGKeyArray,
     grid: Grid,

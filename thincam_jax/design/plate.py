@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
@@ -91,6 +92,7 @@ class Plate(Module):
         return SeeThroughCamera(screen, sensor, self.focal_distance, self.lens_distance)
 
 
+@checked
 class PlateLimits(eqx.Module):
     """Between which plates can be made; equal ends fix a number."""
 
@@ -104,6 +106,7 @@ class PlateLimits(eqx.Module):
         return jax.tree.unflatten(jax.tree.structure(self.lower), list(values))
 
 
+@checked
 class Viewing(eqx.Module):
     """Requirements on what the plate images.
 
@@ -146,6 +149,7 @@ def noise_variance(viewing: Viewing, light: Float[Array, ""]) -> Float[Array, ""
     return 10 ** (-viewing.snr_db / 10) * power * reference * light
 
 
+@checked
 @eqx.filter_jit
 def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     """Expected error and what else is asked of a plate; differentiable in all of its numbers."""
@@ -206,6 +210,7 @@ class FoundPlate(Module):
     history: np.ndarray
 
 
+@checked
 def find_plate(
     viewing: Viewing,
     limits: PlateLimits,

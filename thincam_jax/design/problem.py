@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Polar, Quadrant
@@ -23,6 +24,7 @@ Objective = Callable[[Design, Any], Float[Array, ""]]
 _MARGIN, _FEWEST = 1.1, 128  # of the samples that fringes need; at least
 
 
+@checked
 class DesignProblem(eqx.Module):
     """Problem of a search: minimise `objective` over the designs of `space`.
 
@@ -87,6 +89,7 @@ class DesignProblem(eqx.Module):
         return dataclasses.replace(self, data=change(self.data), exact=exact)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class FrequencyCounts:
     """Sampling of responses: radii and directions in a search, the square of `exact`.
@@ -99,6 +102,7 @@ class FrequencyCounts:
     exact: Annotated[int | None, whole(64, 4096, optional=True)] = None
 
 
+@checked
 def design_problem(
     objective: Objective,
     space: DesignSpace,

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.design.design import Design, Shot
 from thincam_jax.design.objectives import ObjectiveData, ring_means
 from thincam_jax.design.problem import DesignProblem, Objective
@@ -116,6 +117,7 @@ def _alike(space: DesignSpace, one: Found, other: Found) -> bool:
     )
 
 
+@checked
 def score_design(problem: DesignProblem, design: Design, name: str = "") -> RankedDesign:
     """Costs of a design in the search and exactly, and the signal-to-noise ratio of its rings."""
     searched, _ = _cost_and_rings(problem.objective, design, problem.data)

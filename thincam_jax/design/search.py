@@ -20,6 +20,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
@@ -33,6 +34,7 @@ SEPARATION = 0.02
 Status = Literal["converged", "iterations_exhausted", "non_finite"]
 
 
+@checked
 @dataclass(frozen=True)
 class SearchSettings:
     """Length of a search, and its solver.
@@ -45,7 +47,7 @@ class SearchSettings:
     - `tolerance`: relative change of the objective and absolute change in the cube at the end.
     - `separation`: optima closer than this in the cube are one.
 
-    **Errors**: ValueError for numbers of starts, samples or steps below 1.
+    **Errors**: ValueError for numbers of starts, samples or steps out of range.
     """
 
     starts: Annotated[int, whole(1, 1000)] = 16
@@ -56,8 +58,6 @@ class SearchSettings:
     separation: float = SEPARATION
 
     def __post_init__(self):
-        counts = {"starts": self.starts, "samples": self.samples, "steps": self.steps}
-        checks.at_least_one(counts)
         checks.choice("solver", self.solver, get_args(Solver))
 
 
@@ -105,6 +105,7 @@ class Search(Module):
     failed: int
 
 
+@checked
 def find_designs(
     problem: DesignProblem, settings: SearchSettings | None = None, *, key: PRNGKeyArray
 ) -> Search:

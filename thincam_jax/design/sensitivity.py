@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem, Objective
@@ -76,6 +77,7 @@ class Sensitivity:
         return "\n".join(f"{REPORTED[v.variable].of_shots(v.shots)}: {v}" for v in self.values)
 
 
+@checked
 def sensitivity_around(problem: DesignProblem, found: Found) -> Sensitivity:
     """Sensitivity of a problem's objective around a design found, by its ranking data.
 

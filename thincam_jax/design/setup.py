@@ -7,11 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 
 
+@checked
 class PowerLaw(Module):
     r"""Spectral density :math:`\propto (\nu^2 + \nu_0^2)^{-\gamma/2}`, ν in cycles/rad.
 
@@ -38,6 +40,7 @@ class PowerLaw(Module):
         return (frequency_squared / corner**2 + 1) ** (-self.exponent / 2)
 
 
+@checked
 def fit_power_law(images: Iterable[Float[np.ndarray, "y x"]]) -> PowerLaw:
     """The exponent that fits the spectra of photographs best, corner at one cycle a picture.
 
@@ -106,6 +109,15 @@ class PhotonNoise(Module):
         return light / counted + (self.read_noise / counted) ** 2
 
 
+def _noise(given: SignalNoise | PhotonNoise | None) -> SignalNoise | PhotonNoise:
+    return SignalNoise() if given is None else given
+
+
+def _prior(given: PowerLaw | None) -> PowerLaw:
+    return PowerLaw() if given is None else given
+
+
+@checked
 class Setup(Module):
     """A sensor before a scene of mean 1 and the variance `contrast`².
 
@@ -126,12 +138,8 @@ class Setup(Module):
     contrast: Float[Array, ""] = eqx.field(
         default=0.5, converter=quantity("parts of the mean", positive=True)
     )
-    noise: SignalNoise | PhotonNoise = eqx.field(
-        default=None, converter=lambda given: SignalNoise() if given is None else given
-    )
-    prior: PowerLaw = eqx.field(
-        default=None, converter=lambda given: PowerLaw() if given is None else given
-    )
+    noise: SignalNoise | PhotonNoise = eqx.field(default=None, converter=_noise)
+    prior: PowerLaw = eqx.field(default=None, converter=_prior)
     pixel_integration: bool = eqx.field(default=True, converter=bool, static=True)
     crop: bool = eqx.field(default=True, converter=bool, static=True)
 

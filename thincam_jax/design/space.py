@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import FieldError, quantities, quantity, whole
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
@@ -58,6 +59,7 @@ REPORTED = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class Variable:
     """One free number of a design.
@@ -87,6 +89,7 @@ class Variable:
         return tuple(sorted({c // design.phases + 1 for c in self.captures}))
 
 
+@checked
 @dataclass(frozen=True)
 class Limits:
     """Limits of a rig, beside the bounds of single variables.
@@ -105,6 +108,7 @@ class Limits:
     exposure: float | None = None
 
 
+@checked
 class DesignSpace(eqx.Module):
     """Designs with some numbers free, the others as in `base`.
 

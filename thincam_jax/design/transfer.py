@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import ObjectiveData, channels, over_rings
@@ -46,6 +47,7 @@ class ModulationTransfer:
     sums: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
+@checked
 def modulation_transfer(design: Design, data: ObjectiveData) -> ModulationTransfer:
     """The contrast transfer of a design, by the exact response of the square aperture.
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity, whole
 
 Opened = TypeVar("Opened", bound="Device")
@@ -80,6 +81,7 @@ class Device(ABC):
         self.close()
 
 
+@checked
 @dataclass(frozen=True)
 class Region:
     """Part of a sensor, in pixels: rows top … top + height − 1, columns left … left + width − 1."""
@@ -90,6 +92,7 @@ class Region:
     width: Annotated[int, whole(1, 65536)]
 
 
+@checked
 @dataclass(frozen=True)
 class CameraSettings:
     """Camera settings, requested or as `Camera.configure` returns them."""

@@ -13,6 +13,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.hardware.base import Device
 from thincam_jax.hardware.errors import NotFound
 
@@ -34,6 +35,7 @@ _BUILT_IN = {
 KINDS = tuple(_BUILT_IN)
 
 
+@checked
 def drivers(kind: str) -> dict[str, str]:
     """Names of the drivers of "cameras", "stages" or "displays", and the place of each."""
     if kind not in _BUILT_IN:
@@ -42,6 +44,7 @@ def drivers(kind: str) -> dict[str, str]:
     return {**outside, **_BUILT_IN[kind]}
 
 
+@checked
 def driver(kind: str, name: str) -> type[Device]:
     """Class of a driver; `NotFound` where it is unknown, broken or its library is missing."""
     known = drivers(kind)
@@ -79,6 +82,7 @@ def driver_report() -> list[str]:
     return lines
 
 
+@checked
 def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Open a device; `options` are fields of the driver's `Options`."""
     chosen, given = driver(kind, name), dict(options or {})

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
 from thincam_jax.design.match import ResponseModel
 from thincam_jax.design.search import even_samples
@@ -57,6 +58,7 @@ class TrainedSuggester(Module):
     skipped: int
 
 
+@checked
 @dataclass(frozen=True)
 class SuggesterTraining:
     """Size of a network that suggests designs, and its training.
@@ -84,6 +86,7 @@ class SuggesterTraining:
         checks.positive("rate", self.rate, "a number")
 
 
+@checked
 def train_suggester(
     model: ResponseModel, settings: SuggesterTraining = SuggesterTraining(), *, key: PRNGKeyArray
 ) -> TrainedSuggester:

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
@@ -49,6 +50,7 @@ STEPS = 2
 _DAMPINGS = (0.01, 0.3, 10.0)
 
 
+@checked
 class Suggester(eqx.Module):
     """A network from target levels to guesses in the unit cube, and the model that judges them.
 
@@ -187,6 +189,7 @@ class Suggestion(Module):
     point: Float[Array, " variable"]
 
 
+@checked
 def suggest(suggester: Suggester, target: Numbers, *, tolerance_db: float = MATCHED) -> Suggestion:
     """A design whose levels are near to target ones, in some tens of milliseconds once compiled.
 
@@ -219,11 +222,13 @@ def suggest(suggester: Suggester, target: Numbers, *, tolerance_db: float = MATC
 _KIND = "suggester"
 
 
+@checked
 def save_suggester(path: str | os.PathLike[str], suggester: Suggester) -> Path:
     """Write a trained suggester with its camera; whole or not at all."""
     return write_arrays(path, suggester, _described(suggester))
 
 
+@checked
 def load_suggester(path: str | os.PathLike[str], model: ResponseModel) -> Suggester:
     """Read a suggester that was trained for the space and camera of `model`.
 

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import check_fields, quantity, whole
 from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.learn.checkpoint import (
@@ -37,6 +38,7 @@ _COUNTS = ("step", "skipped", "retreats")
 TrainingStatus = Literal["finished", "stopped", "diverged"]
 
 
+@checked
 @dataclass(frozen=True)
 class TrainingOptions:
     """Length and rate of a training.

@@ -7,6 +7,7 @@ import scipy
 from jaxtyping import Bool, Float, Shaped
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 Demosaicing = Literal["bilinear", "superpixel"]
@@ -19,6 +20,7 @@ _GREEN = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32)
 _KERNELS = {"R": _SPARSE, "G": _GREEN, "B": _SPARSE}
 
 
+@checked
 def demosaic(
     mosaic: Shaped[np.ndarray, "y x"],
     pattern: Pattern,
@@ -57,6 +59,7 @@ def demosaic(
     return np.stack(channels, axis=-1)
 
 
+@checked
 def demosaic_mask(
     mask: Bool[np.ndarray, "y x"], pattern: Pattern, method: Demosaicing = "bilinear"
 ) -> Bool[np.ndarray, "rows columns 3"]:

@@ -17,6 +17,7 @@ import PIL.Image
 import tifffile
 from jaxtyping import Bool
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
@@ -55,6 +56,7 @@ class NonlinearWarning(UserWarning):
     """A capture that is not in proportion to the light."""
 
 
+@checked
 def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     """Read one image as it is stored, without scaling or gamma.
 
@@ -70,6 +72,7 @@ def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     return _raw(pixels, found if bits is None else bits, kind, str(path))
 
 
+@checked
 def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[Raw]:
     """Read the pages of a TIFF, or the files of a folder in the order of `image_files`.
 
@@ -90,6 +93,7 @@ def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str) -> Raw:
         raise CaptureFileError(str(error)) from None
 
 
+@checked
 def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
     """Read a map (y, x) from a one-channel image file, True where it is not zero.
 
@@ -106,6 +110,7 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
     return pixels != 0
 
 
+@checked
 def list_captures(folder: str | os.PathLike[str], bits: int | None = None) -> list[Path]:
     """List the image files of a folder as `image_files` does, after reading each one.
 

@@ -10,8 +10,11 @@ from typing import Any, Literal
 
 import numpy as np
 import tifffile
-from jaxtyping import ArrayLike, Float, UInt8
+from jaxtyping import UInt8
 
+from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.files import write_whole
 from thincam_jax.imaging.display import eight_bit, png_bytes
 from thincam_jax.measured.raw import MeasurementError
@@ -20,9 +23,10 @@ LINEAR = (".npy", ".tif", ".tiff")
 WhiteBalance = tuple[float | int, float | int, float | int] | Literal["grey_world"] | None
 
 
+@checked
 def write_image(
     path: str | os.PathLike[str],
-    image: Float[ArrayLike, "channel y x"],
+    image: Numbers,
     log: Mapping[str, Any] | None = None,
     *,
     white_balance: WhiteBalance = None,
@@ -50,14 +54,15 @@ def write_image(
             to_display(image, white_balance=white_balance, gamma=gamma, percentile=percentile)
         )
     else:
-        content = linear_bytes(np.asarray(image, dtype=np.float32), suffix)
+        content = linear_bytes(checks.numbers("image", image).astype(np.float32), suffix)
     if log is not None:
         write_whole(path.with_suffix(".json"), log_text(log))
     return write_whole(path, content)
 
 
+@checked
 def to_display(
-    image: Float[ArrayLike, "channel y x"],
+    image: Numbers,
     *,
     white_balance: WhiteBalance = None,
     gamma: float | int = 2.2,
@@ -75,7 +80,7 @@ def to_display(
     **Errors**: MeasurementError for another number of channels, values that are not finite, gains
     with an image of one channel, and numbers out of range.
     """
-    linear = np.asarray(image, dtype=np.float64)
+    linear = checks.numbers("image", image).astype(np.float64)
     if linear.ndim != 3 or linear.shape[0] not in (1, 3) or linear.size == 0:
         raise MeasurementError(
             f"an image of shape {linear.shape} cannot be displayed; give (1, y, x) or (3, y, x)"
@@ -117,6 +122,7 @@ def _gains(image: np.ndarray, white_balance: WhiteBalance) -> np.ndarray:
     return gains
 
 
+@checked
 def log_text(log: Mapping[str, Any]) -> str:
     """JSON with sorted keys; non-finite numbers become null, arrays lists."""
     plain = _plain(log)

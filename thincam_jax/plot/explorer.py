@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.grids import Grid
@@ -73,6 +74,7 @@ class View:
         return json.dumps(header), [*self.pictures.values()]
 
 
+@checked
 class Explorer:
     """The settings of a camera, and what it sees with each.
 

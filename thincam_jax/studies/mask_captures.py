@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
@@ -26,6 +27,7 @@ from thincam_jax.studies.study import Synthesis, synthesis_matrix
 _TOLERANCE, _STEPS = 1e-3, 400
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class ComparedMask:
     """One mask, or the several that a camera takes one after the other.
@@ -54,6 +56,7 @@ class ComparedMask:
         return synthesis_matrix(self.synthesis, 1, 1)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Setting:
     """What all masks have in common.

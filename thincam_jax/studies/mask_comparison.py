@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table, number
 from thincam_jax.imaging.metrics import psnr, ssim
@@ -35,6 +36,7 @@ Colours = Literal["one wavelength", "broadband"]
 Estimate = Literal["total variation", "linear", "focused far"]
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class ComparedScene:
     """A scene on the field's pixels (y, x), 0 to 1, as it is cast on the sensor.
@@ -68,6 +70,7 @@ class ComparedScene:
         return slope, slope * (2 * math.pi / max(self.image.shape)) ** 2
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Tuning:
     """τ of total variation, for each mask and light: the best of `tau` on a scene of its own."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.imaging.metrics import cut_off, first_common_zero
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.phase_shift import without_carrier
@@ -35,6 +36,7 @@ class Response:
     limits: Limits
 
 
+@checked
 def method_response(study: Study, method: Method) -> Response:
     """The response with the finite mask, for a point on the axis, and its limits.
 

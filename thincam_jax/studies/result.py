@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.table import Table, number
 from thincam_jax.reconstruction import FringeScanning
 from thincam_jax.studies.evaluate import Evaluation, Resolved, Scores, evaluate_method
@@ -307,6 +308,7 @@ def run(study: Study, targets: Sequence[Target]) -> StudyResult:
     return StudyResult(study, tuple(targets), evaluations, responses)
 
 
+@checked
 def evaluate_target(study: Study, target: Target) -> dict[str, Evaluation]:
     """Every method on one target; captures that methods share are taken once."""
     captures = {exposure: take(study, exposure, target) for exposure in study.exposures}

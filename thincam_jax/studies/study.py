@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Array
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import decimal_value
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.imaging import targets as drawn
@@ -43,6 +44,7 @@ def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarra
     return getattr(syntheses, synthesis)(shots if synthesis in _PHASES else shots * phases)
 
 
+@checked
 @dataclass(frozen=True)
 class Published:
     """Figures that a publication gives for a method; None where it gives none."""
@@ -52,6 +54,7 @@ class Published:
     limit_cycles_per_mm: float | None = None
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Method:
     """A reconstruction and the exposures that it takes.
@@ -162,6 +165,7 @@ class Method:
         return synthesis_matrix(self.synthesis, shots, self.phases)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Target:
     """A scene at one distance, in mm as its width.
@@ -247,6 +251,7 @@ def check_methods(methods: Sequence[Method], sensor: Sensor, noise: AbstractNois
     check_noise(sensor, noise)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Study:
     """Cameras before targets, and the methods that reconstruct their captures.

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import decimal_value
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, Sensor
 from thincam_jax.lensless.exposures import Exposures
@@ -24,6 +25,7 @@ _PUBLISHED = (
 )
 
 
+@checked
 def superresolution(
     betas: tuple[float, float] = (25.0, 21.0),
     distances: tuple[float, float] = (5.0, 6.5),

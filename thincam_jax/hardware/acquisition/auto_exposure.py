@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.hardware.errors import OutOfRange, Saturated
 
 _MOST = 8.0  # largest factor from one exposure to the next
 _REMEDY = "change the light or the limits of the auto-exposure"
 
 
+@checked
 @dataclass(frozen=True)
 class AutoExposure:
     """Target of the search: `quantile` of the pixels at `target` of full scale, within `tolerance`.
@@ -36,6 +38,7 @@ class AutoExposure:
             )
 
 
+@checked
 def find_exposure(
     level_at: Callable[[float], float], start: float, wanted: AutoExposure, camera: str
 ) -> float:

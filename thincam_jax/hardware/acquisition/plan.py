@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import check_fields
 from thincam_jax.hardware.base import CameraSettings, Region
 
@@ -28,6 +29,7 @@ FRINGE_SCAN = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)  # phases, rad
 PHASE_PAIR = (0.0, 1.5 * math.pi)
 
 
+@checked
 @dataclass(frozen=True)
 class Pattern:
     """Pattern on a display: a kind and the numbers that define it.
@@ -54,6 +56,7 @@ class Pattern:
 BLACK = Pattern("black")
 
 
+@checked
 @dataclass(frozen=True)
 class Step:
     """One frame: its pattern and settings by their number in the plan, and the stage position.
@@ -68,6 +71,7 @@ class Step:
     dark: bool = False
 
 
+@checked
 @dataclass(frozen=True)
 class Plan:
     """An ordered list of steps.
@@ -162,6 +166,7 @@ def settings_from(record: Mapping[str, Any]) -> CameraSettings:
     return found
 
 
+@checked
 def zone_plate(
     beta: float, width: float, *, phase: float = 0.0, profile: str = "cosine"
 ) -> Pattern:
@@ -170,6 +175,7 @@ def zone_plate(
     return Pattern("fza", {**numbers, "profile": profile})
 
 
+@checked
 def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_frames: int = 0) -> Plan:
     """Four captures of one zone plate with the phases 0, π/2, π and 3π/2.
 
@@ -180,6 +186,7 @@ def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_frames: int = 0
     return _plan("fringe_scan", shots, settings, dark_frames)
 
 
+@checked
 def method_a(
     mask: Pattern,
     distances: Sequence[float],
@@ -200,6 +207,7 @@ def method_a(
     return _plan("method_a", shots, settings, dark_frames, {"stage_zero": float(stage_zero)})
 
 
+@checked
 def method_b(
     mask: Pattern, betas: Sequence[float], settings: CameraSettings, *, dark_frames: int = 0
 ) -> Plan:
@@ -210,6 +218,7 @@ def method_b(
     return _plan("method_b", shots, settings, dark_frames)
 
 
+@checked
 def psf_stack(
     mask: Pattern,
     depths: Sequence[float],
@@ -226,11 +235,14 @@ def psf_stack(
     return _plan("psf_stack", shots, settings, dark_frames, {"stage_zero": float(stage_zero)})
 
 
+@checked
 def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
     """The frames of a calibration by Hadamard patterns, which `open_captures` reads.
 
     The dark frames of the series are spread evenly among the patterns, the first one first.
     """
+    if not dataclasses.is_dataclass(series):
+        raise TypeError(f"series is {series!r:.60}; give HadamardSeries(object_shape, …)")
     described = dataclasses.asdict(series)
     rows, columns = series.object_shape
     numbers = {"rows": rows, "columns": columns, "order": series.order, "display": series.display}

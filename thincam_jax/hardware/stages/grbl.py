@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.hardware.base import Identity
 from thincam_jax.hardware.errors import Disconnected, HardwareError, ProtocolError, Timeout
 from thincam_jax.hardware.stages import serial_stage
@@ -90,6 +91,7 @@ class GrblStage(SerialStage):
 
     _protocol = "grbl"
 
+    @checked
     @dataclass(frozen=True)
     class Options(SerialOptions):
         """Also `axis`, and `speed`, mm/s; None: as fast as the machine allows."""

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.hardware import errors
 from thincam_jax.hardware.base import Stage
 from thincam_jax.hardware.errors import HardwareError, NotHomed, ProtocolError, Timeout
@@ -32,6 +33,7 @@ class Report:
     position: float  # mm
 
 
+@checked
 @dataclass(frozen=True)
 class SerialOptions:
     """Options of a stage in a config file."""

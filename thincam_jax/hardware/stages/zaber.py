@@ -9,6 +9,7 @@ import re
 import time
 from dataclasses import dataclass
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.hardware.base import Identity
 from thincam_jax.hardware.errors import NotHomed, ProtocolError, Timeout
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
@@ -86,6 +87,7 @@ class ZaberStage(SerialStage):
 
     _protocol = "zaber"
 
+    @checked
     @dataclass(frozen=True)
     class Options(SerialOptions):
         """Also the stage's place in the chain, and the length of its microstep."""

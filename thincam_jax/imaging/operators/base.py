@@ -183,7 +183,7 @@ def require_size(name: str, shape: Any, count: int, what: str) -> tuple[int, ...
 
 def real_numbers(name: str, value: Any) -> Float[Array, "..."]:
     """Finite floating numbers as an array; whole numbers become floating ones."""
-    array = checks.as_array(value)
+    array = checks.array(name, value, allow_complex=True)
     if jnp.issubdtype(array.dtype, jnp.integer):
         array = checks.as_array(value, floating=True)
     if not jnp.issubdtype(array.dtype, jnp.floating):

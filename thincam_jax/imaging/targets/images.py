@@ -10,6 +10,7 @@ import skimage
 from jaxtyping import ArrayLike, Float64, Num
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 
 # Files inside the scikit-image package itself; other names of `skimage.data` need a download.
 _PLAIN = (
@@ -27,6 +28,7 @@ _SAMPLES = {name: f"{name}.png" for name in _PLAIN} | {
 }
 
 
+@checked
 def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channel"]:
     """An image file as float64 in [0, 1], of shape (y, x), or (y, x, 3) if it has colours.
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
@@ -32,6 +33,7 @@ _SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
 LEAST, MOST = 1 / 255, 100 / 255
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class DenoiserOptions:
     """Size of the network: see `DenoisingUNet`.
@@ -52,6 +54,7 @@ class DenoiserOptions:
             )
 
 
+@checked
 class Denoiser(Module):
     r"""Remove white Gaussian noise of known standard deviation from grey images of any size.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.quantity import FieldError, quantity, whole
@@ -47,6 +48,7 @@ class Stand(eqx.Module):
         return jnp.concatenate([part, beyond]) - jnp.concatenate([0 * beyond, part])
 
 
+@checked
 class RefocusCamera(eqx.Module):
     """A camera, its light, its image and the range of distances on which it is to be focused.
 

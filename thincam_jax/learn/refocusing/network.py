@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
@@ -30,6 +31,7 @@ from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.unet import UNet
 
 
+@checked
 @dataclass(frozen=True)
 class NetworkOptions:
     """Architecture of a network.

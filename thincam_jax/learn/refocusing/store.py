@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.text import of_error
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.learn.checkpoint import (
@@ -35,6 +36,7 @@ _LISTED = 64
 _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
 
 
+@checked
 def save(
     path: str | os.PathLike[str], network: RefocusNetwork, told: dict[str, Any] | None = None
 ) -> Path:
@@ -51,6 +53,7 @@ def save(
     return write_arrays(path, network.weights, description)
 
 
+@checked
 def load(
     path: str | os.PathLike[str], cameras: LenslessCamera | RefocusCamera | Cameras
 ) -> RefocusNetwork:

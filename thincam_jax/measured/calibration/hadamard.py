@@ -18,6 +18,7 @@ import scipy
 from jaxtyping import Float, Int8, Integer, Real, UInt8
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import check_fields, choice, whole
 
 Order = Literal["sequency", "natural"]
@@ -25,6 +26,7 @@ Display = Literal["complementary", "binary"]
 DARK_FRAMES = whole(0, 4096)
 
 
+@checked
 @dataclass(frozen=True)
 class HadamardSeries:
     """Sequence of patterns for a calibration with a monitor.
@@ -80,6 +82,7 @@ class HadamardSeries:
         return (sign * pattern > 0).astype(np.uint8)
 
 
+@checked
 def hadamard_pattern(
     index: int | np.integer, object_shape: tuple[int, int], order: Order = "sequency"
 ) -> Int8[np.ndarray, "y x"]:
@@ -118,6 +121,11 @@ def walsh_hadamard(
     three times faster on a CPU than butterflies. The precision is that of `out`, where given, else
     that of the values, at least float32.
     """
+    values = checks.numbers("values", values)
+    if values.ndim != 2:
+        raise ValueError(
+            f"values has shape {values.shape}; give a row for each pattern, (n, pixel)"
+        )
     count, pixels = values.shape
     _require_power_of_two((count, 1))
     if out is None:

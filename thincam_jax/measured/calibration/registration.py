@@ -12,6 +12,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum, central_blocks, centred_indices
 from thincam_jax._core.module import Module
@@ -49,6 +50,7 @@ class Registration(Module):
     reasons: tuple[str, ...] = eqx.field(static=True)
 
 
+@checked
 def estimate_registration(
     capture: Numbers,
     reference: Numbers,

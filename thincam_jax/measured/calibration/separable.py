@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import Separable
@@ -49,6 +50,7 @@ class SeparableFit(Module):
     reason: str
 
 
+@checked
 def calibrate_separable(
     rows: Num[np.ndarray, "m y x"], columns: Num[np.ndarray, "n y x"], *, shown: Shown = "stripes"
 ) -> SeparableFit:
@@ -100,6 +102,7 @@ def calibrate_separable(
     return SeparableFit(operator, float(missed), "ok", reason)
 
 
+@checked
 def fit_separable(
     images: Float[Array, "j m n"],
     captures: Float[Array, "j y x"],

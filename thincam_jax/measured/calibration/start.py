@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
@@ -20,6 +21,7 @@ _FARTHEST = 1e-6
 _WIDEST = 0.5  # relative search range
 
 
+@checked
 @dataclass(frozen=True)
 class PsfSearch:
     """Numbers that `fit_psf` fits, how far from the camera given, and by which model.
