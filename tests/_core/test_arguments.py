@@ -1,6 +1,6 @@
 """Arguments of another kind than annotated: one line with what was given and what to give."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -98,3 +98,13 @@ def test_traced_numbers_pass():
         return 2 * number * image
 
     np.testing.assert_allclose(jax.jit(twice)(3.0, jnp.ones(2)), 6.0)
+
+
+def test_a_generator_is_taken_where_anything_that_yields_is():
+    @checked
+    def total(values: Iterable[float]) -> float:
+        return sum(values)
+
+    assert total(n / 2 for n in (1, 3)) == total([0.5, 1.5]) == 2.0
+    with pytest.raises(TypeError, match="a sequence, each a number, or a generator|or a generator"):
+        total("a")  # pyright: ignore[reportArgumentType]

@@ -77,7 +77,10 @@ def _kinds(annotation: Any) -> _Kinds:
         each = [_kinds(part) for part in parts]
         return sum(each, ()) if all(each) else ()
     if origin in (tuple, Sequence, Iterable):
-        return (_several(parts, fixed=origin is tuple and parts[-1:] != (...,)),)
+        several = _several(parts, fixed=origin is tuple and parts[-1:] != (...,))
+        # What a generator yields is not known before it is used.
+        drawn = _Kind(lambda value: isinstance(value, Iterator), lambda: "a generator")
+        return (several, drawn) if origin is Iterable else (several,)
     plain = _PLAIN.get(str if origin is Literal else origin or annotation)
     if plain is not None or not isinstance(annotation, type):
         return () if plain is None else (plain,)
