@@ -3,11 +3,14 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
+from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.operators import AbstractOperator
@@ -83,8 +86,11 @@ def reconstructed(
 class PublishedImage:
     """Figures that a publication gives for a target and a solver; None where it gives none."""
 
-    psnr_db: float | None = None
-    seconds: float | None = None
+    psnr_db: Annotated[float | None, quantity("dB", check=checks.decibels, optional=True)] = None
+    seconds: Annotated[float | None, quantity("seconds", positive=True, optional=True)] = None
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 def beside(
