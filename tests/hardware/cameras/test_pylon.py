@@ -90,7 +90,7 @@ def test_without_a_region_the_whole_sensor(camera):
     [
         (CameraSettings(100.0), "1e-06 … 10 s"),
         (CameraSettings(1e-3, Region(0, 0, 25, 40)), "24 × 40"),
-        (CameraSettings(1e-3, Region(0, -1, 2, 2)), "24 × 40"),
+        (CameraSettings(1e-3, Region(0, 39, 2, 2)), "24 × 40"),
         (CameraSettings(1e-3, pixel_format="RGB8"), "Mono8, Mono10, Mono12, Mono16"),
         (CameraSettings(1e-3, gain=100.0), "0 … 48 dB"),
     ],
