@@ -16,7 +16,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import lit_mask
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.units import deg, nm, um
 
-SENSOR, EVERY = tc.Sensor((9, 12), 150 * um), (2, 3)
+SENSOR, EVERY = tc.Sensor((9, 12), 150 * um), (1, 1)
 DISTANCE, INF = 5.0, float("inf")
 
 
