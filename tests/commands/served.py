@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
 import urllib.error
@@ -44,3 +46,13 @@ def served(*words, cwd=None):
         port, token = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]+)", address).groups()
         yield child, int(port), token
         child.kill()
+
+
+def assert_ctrl_c_frees(child, port):
+    """Ctrl-C ends the process in one line, and its port can be taken."""
+    child.send_signal(signal.SIGINT)
+    _, told = child.communicate(timeout=60)
+    assert (child.returncode, told) == (130, "thincam: interrupted\n")
+    with socket.socket() as own:
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        own.bind(("127.0.0.1", port))

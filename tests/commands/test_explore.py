@@ -2,11 +2,10 @@
 
 import json
 import shutil
-import signal
 import socket
 
 import pytest
-from commands.served import asked, served
+from commands.served import asked, assert_ctrl_c_frees, served
 from commands.study import tiny
 from commands.test_cli import call, one_line
 
@@ -87,12 +86,7 @@ def test_a_browser_shows_the_last_value_of_a_drag(explored, tmp_path):
 @pytest.mark.thorough
 def test_ctrl_c_frees_the_port(explored):
     child, port, _ = explored
-    child.send_signal(signal.SIGINT)
-    _, told = child.communicate(timeout=60)
-    assert (child.returncode, told) == (130, "thincam: interrupted\n")
-    with socket.socket() as own:
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        own.bind(("127.0.0.1", port))
+    assert_ctrl_c_frees(child, port)
 
 
 def test_what_cannot_be_explored(tmp_path):

@@ -3,7 +3,6 @@
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
 
-from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -20,7 +19,8 @@ def serve_page(shown: Any, title: str, port: int, browser: bool) -> None:
     from thincam_jax.plot.page import serve
 
     try:
-        serve(shown, title, port, partial(say_result, "address"), browser)
+        told_of = lambda at: say_result("address", at, f"{at}\nCtrl-C ends it.")  # noqa: E731
+        serve(shown, title, port, told_of, browser)
     except ImportError:
         raise ConfigError("pages need pip install 'thincam_jax[notebook]'") from None
     except OSError as error:

@@ -91,7 +91,7 @@ class Preview:
     - `image`: what is reconstructed of a frame (y, x) of the first pattern, as levels 0 to 1.
     - `folder`: of the frames that are kept.
 
-    A device that fails is told of in a line; an unplugged camera is opened again.
+    The error of a device is shown as a line; an unplugged camera is opened again.
     """
 
     captions = {

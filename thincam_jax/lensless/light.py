@@ -1,4 +1,4 @@
-"""Light over the field: what of it a point off the axis sends to the sensor."""
+"""Light over the field: how bright a point off the axis is on the sensor."""
 
 import jax.numpy as jnp
 import numpy as np

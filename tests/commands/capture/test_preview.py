@@ -2,13 +2,11 @@
 
 import json
 import shutil
-import signal
-import socket
 
 import pytest
 import tifffile
 from commands.capture import tiny
-from commands.served import asked, served
+from commands.served import asked, assert_ctrl_c_frees, served
 from commands.test_cli import call, one_line
 
 pytest.importorskip("starlette")
@@ -80,12 +78,7 @@ def test_a_browser_shows_frame_after_frame(previewed):
 @pytest.mark.thorough
 def test_ctrl_c_frees_the_port(previewed):
     child, port, *_ = previewed
-    child.send_signal(signal.SIGINT)
-    _, told = child.communicate(timeout=60)
-    assert (child.returncode, told) == (130, "thincam: interrupted\n")
-    with socket.socket() as own:
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        own.bind(("127.0.0.1", port))
+    assert_ctrl_c_frees(child, port)
 
 
 def test_files_of_another_kind_and_devices_that_are_not_there(tmp_path):

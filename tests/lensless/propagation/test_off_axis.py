@@ -16,7 +16,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import lit_mask
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.units import deg, nm, um
 
-SENSOR, EVERY = tc.Sensor((9, 12), 150 * um), (1, 1)
+SENSOR = tc.Sensor((9, 12), 150 * um)
 DISTANCE, INF = 5.0, float("inf")
 
 
@@ -49,19 +49,18 @@ def seen(mask, angle, azimuth, distance, **how):
     camera = tc.LenslessCamera(mask(tuple(DISTANCE * tangent)), SENSOR, DISTANCE)
     at = tangent if distance == INF else (distance + DISTANCE) * tangent
     h = tc.psf(camera, wavelength=500 * nm, object_distance=distance, at=at, **how)
-    return np.asarray(h, float)[:: EVERY[0], :: EVERY[1]]
+    return np.asarray(h, float)
 
 
 def direct(mask, angle, azimuth, distance):
-    """At EVERY so many pixels by the sum over the mask, which is on the axis, about the ray."""
+    """The same by the sum over the mask, which lies on the axis, and where the ray meets."""
     tangent = tangents(angle, azimuth)
     at = tangent if distance == INF else distance * tangent
     own = mask()
     path = tc.LenslessCamera(own, SENSOR, DISTANCE).path(500 * nm, distance, at)
     moved = DISTANCE * tangent / np.asarray(SENSOR.pitch)
     rows, columns = (
-        np.arange(0, n, step) - (n - 1) / 2 - m
-        for n, m, step in zip(SENSOR.shape, moved, EVERY, strict=True)
+        np.arange(n) - (n - 1) / 2 - m for n, m in zip(SENSOR.shape, moved, strict=True)
     )
     points = SparseGrid(rows, columns, SENSOR.pitch)
     return np.abs(_field(own, path, points)) ** 2 * (1 + DISTANCE / distance) ** 2

@@ -125,8 +125,8 @@ def preview(
                 if asked.optics is not None:
                     shape = (region.height, region.width) if region else rig.camera.sensor_shape
                     image = live_image(build_study(asked, shape), asked.optics.object.width)
-                shown = Preview(rig, plan, image=image, settle=asked.display.settle)
-                serve_page(shown, asked.name, port, browser)
+                timing = {"settle": asked.display.settle, "timeout": asked.acquisition.timeout}
+                serve_page(Preview(rig, plan, image=image, **timing), asked.name, port, browser)
         except HardwareError as error:
             tell(str(error))
             raise typer.Exit(STOPPED) from None

@@ -117,7 +117,7 @@ class ModelConfig(section(ScreenModel, without=("name",))):
     name: Name
 
 
-class PublishedConfig(section(PublishedImage)):
+class PublishedConfig(section(PublishedImage, defaults={"psnr_db": ..., "seconds": ...})):
     """What a publication reports of a target."""
 
 

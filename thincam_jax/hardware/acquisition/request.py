@@ -1,4 +1,4 @@
-"""What is to be captured, as numbers: the plan of a file, checked before devices are opened."""
+"""A plan of captures given by its numbers, checked before any device is opened."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
