@@ -40,12 +40,14 @@ def checked(what: Any = None, *, typechecker: Any = None) -> Any:
         return what
     if any(isinstance(hint, str) for hint in hints):  # names of classes that may not be there yet
         return JAXTYPED(what, typechecker=check)
-    function, named = check(what), any(map(has_shape, hints))
+    function, named = None, any(map(has_shape, hints))
 
     @functools.wraps(what)
     def call(*args: Any, **kwargs: Any) -> Any:
+        nonlocal function
         if jaxtyping.config.jaxtyping_disable:
             return what(*args, **kwargs)
+        function = function or check(what)  # at the first call: most are not made in one process
         if not named:
             return function(*args, **kwargs)
         with SHAPES:
