@@ -1,5 +1,7 @@
 """The lensless camera: its distance, the way of the light through it, its gradients."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +10,14 @@ import pytest
 import thincam_jax as tc
 from thincam_jax.units import nm, um
 
+MASK = tc.FresnelZoneAperture(25.0, width=5.632)
+
 
 def camera(distance=6.5):
-    mask = tc.FresnelZoneAperture(25.0, width=5.632)
-    return tc.LenslessCamera(mask=mask, sensor=tc.Sensor((80, 96), 5.5 * um), distance=distance)
+    return tc.LenslessCamera(mask=MASK, sensor=tc.Sensor((80, 96), 5.5 * um), distance=distance)
+
+
+CAMERA = camera()  # of known numbers, not of those of a trace
 
 
 def test_path_of_the_thesis_camera():
@@ -54,6 +60,23 @@ def test_a_camera_is_a_tree_of_its_numbers():
     assert float(slopes.mask.width) == pytest.approx(1.026)
     assert float(slopes.distance) == pytest.approx(5.632 / 250)
     assert float(slopes.mask.beta) == 0.0 and float(slopes.sensor.pitch) == 0.0
+
+
+def test_a_point_known_to_lie_on_an_axis_of_the_mask_is_not_skew_inside_jit():
+    """As for a slope in the other coordinate; skew PSFs take many times longer."""
+    skew = []
+
+    @jax.jit
+    def trace(x, centre):
+        moved = tc.FresnelZoneAperture(25.0, width=5.632, centre=(0.0, 0.1))
+        traced = tc.FresnelZoneAperture(25.0, width=5.632, centre=centre)
+        for one, at in [(None, (0.0, x)), (None, (x, 0)), (None, (x, x)), (moved, (x, 0.0))]:
+            chosen = replace(CAMERA, mask=one or MASK)
+            skew.append(chosen.path(500 * nm, 250.0, at).skew)
+        skew.append(replace(CAMERA, mask=traced).path(500 * nm, 250.0, (0.0, x)).skew)
+
+    trace(3.0, jnp.zeros(2))
+    assert skew == [False, False, True, True, True]
 
 
 def test_swapped_arguments_are_refused():

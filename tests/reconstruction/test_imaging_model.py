@@ -74,6 +74,7 @@ def wide_recording(model, **changes):
     return tc.Recording([capture], cameras, noise_variance=1e-8), scene
 
 
+@pytest.mark.thorough
 def test_cameras_over_the_field_explain_their_capture():
     """Upright, with the object's pixels; the PSF and the light of the axis leave some percent."""
     unexplained = {}

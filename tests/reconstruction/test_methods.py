@@ -145,17 +145,26 @@ def test_measured_psfs_and_operators_need_the_crop():
         assert solver.name == "admm_tv" and message in reason
 
 
-def test_low_rank_operators_take_proximal_gradients():
-    """One application an iteration in place of a linear system; the same minimiser."""
+@pytest.fixture(scope="module")
+def low_rank_recording():
     rng = np.random.default_rng(3)
     psfs = rng.uniform(size=(3, 3, 5, 5)) ** 4
     operator = low_rank_psf(psfs, 1.0, (16, 19), (16, 19), tolerance=1e-3).operator
     image = np.zeros((16, 19))
     image[4:9, 5:12] = 1.0
     seen = operator(jnp.asarray(image)) + 0.05 * rng.normal(size=image.shape)
-    recording = tc.Recording(seen, operator, noise_variance=0.05**2)
-    solver, reason = tc.choose_solver(recording)
+    return tc.Recording(seen, operator, noise_variance=0.05**2)
+
+
+def test_low_rank_operators_take_proximal_gradients(low_rank_recording):
+    """One application an iteration in place of a linear system."""
+    solver, reason = tc.choose_solver(low_rank_recording)
     assert solver.name == "fista" and "sum of many convolutions" in reason
+
+
+@pytest.mark.thorough
+def test_proximal_gradients_find_the_same_minimiser(low_rank_recording):
+    recording = low_rank_recording
     found, slow = (
         tc.reconstruct(recording, s).image for s in (tc.Fista(iterations=400), tc.AdmmTV())
     )

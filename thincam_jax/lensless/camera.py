@@ -65,10 +65,19 @@ class LenslessCamera(Module):
             object_distance = like(object_distance)
         if at is None:
             return Path(wavelength, self.distance, object_distance)
+        on_an_axis = self._knows_axis(at)
         if isinstance(at, tuple | list):
             if all(isinstance(n, int | float) for n in at):
                 at = like(at)
             elif any(map(checks.is_traced, at)):
                 at = jnp.stack([jnp.asarray(n, self.distance.dtype) for n in at])
         path = Path(wavelength, self.distance, object_distance, at)
-        return replace(path, skew=path.is_skew(self.mask.centre))
+        return replace(path, skew=not on_an_axis and path.is_skew(self.mask.centre))
+
+    def _knows_axis(self, at: Position) -> bool:
+        """Whether one coordinate of a point is known to be 0, and the mask's to be 0, too."""
+        centre = self.mask.centre
+        if checks.is_traced(centre) or not isinstance(at, tuple | list):
+            return False
+        pairs = zip(at, np.asarray(centre), strict=False)  # other lengths are refused by the path
+        return any(isinstance(n, int | float) and n == c == 0 for n, c in pairs)

@@ -1,6 +1,7 @@
 """A camera whose numbers are turned by hand: the controls, and the pictures of each setting."""
 
 import dataclasses
+import functools
 import json
 import math
 import operator
@@ -28,16 +29,20 @@ from thincam_jax.lensless.accuracy import select_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.method import PsfMethod, has_few_terms
 from thincam_jax.lensless.phase_shift import fringe_scanned_otf, with_phase, without_carrier
 from thincam_jax.reconstruction import Cameras, FringeScanning, Recording, Wiener, reconstruct
+from thincam_jax.studies.psf_accuracy import relative_error
 from thincam_jax.units import nm
 
 # Part of the sensor's width that the scene's image has.
 _FILLED = 0.7
 # How far a control goes below and above its value.
 _LOWEST, _HIGHEST = 0.25, 2.5
-_SNR_DB, _TOLERANCE = 30.0, 1e-2
+_SNR_DB = 30.0
 _MOST_PIXELS = 2048  # of a sensor's side
+_ANGLE = Control("angle", "angle off the axis", "°", -30.0, 30.0, 0.0, math.pi / 180)
+_TOLERANCE = Control("tolerance", "tolerance", "%", 0.1, 20.0, 1.0, 1e-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +86,8 @@ class Explorer:
     While a control is moved the PSF and the transfer function follow, by one compiled program: new
     values are not compiled for. At rest come a noisy capture of the scene (30 dB), its Wiener
     reconstruction (of four captures by fringe scanning where the mask is a zone aperture), and the
-    cheapest model within a tolerance of 1 %. The scene keeps its size on the sensor, 0.7 of its
-    width.
+    cheapest model within the tolerance that is set. The scene keeps its size on the sensor, 0.7 of
+    its width, and is about the axis. Of masks of few terms the PSF is about a ray at an angle.
 
     **Arguments**
 
@@ -115,7 +120,9 @@ class Explorer:
             "wavelength": float(checks.wavelength("wavelength", wavelength)),
             "object_distance": float(checks.positive("object_distance", object_distance, "mm")),
         }
-        self.controls = (*_controls_of(camera), *_controls_of_light(**light))
+        self.controls = (*_controls_of(camera), *_controls_of_light(**light), _TOLERANCE)
+        # The camera is known, not traced: so is then that the point lies on an axis of the mask.
+        self._moving = jax.jit(functools.partial(_moving, camera))
         self.values = {control.name: control.value for control in self.controls}
 
     @property
@@ -129,6 +136,11 @@ class Explorer:
         numbers = self._numbers()
         return {name: numbers[name] for name in ("wavelength", "object_distance")}
 
+    @property
+    def at(self) -> tuple[float, float]:
+        """(y, x) of the PSF's point as it is set, mm: `at` of `tc.psf`."""
+        return _point(self._numbers())
+
     def turn(self, values: dict[str, float]) -> None:
         """Set controls, each within its range; ValueError names one that does not exist."""
         self.values |= turned(self.controls, values)
@@ -137,7 +149,7 @@ class Explorer:
         """The pictures of the setting; those that take long only at rest."""
         like = self._first.distance.dtype
         traced = {name: jnp.asarray(value, like) for name, value in self._numbers().items()}
-        levels, profile = jax.device_get(_moving(self._first, traced))
+        levels, profile = jax.device_get(self._moving(traced))
         step = 1 / (self._first.sensor.shape[1] * float(self._first.sensor.pitch))
         frequency = np.arange(1, profile.size) * step
         magnitude = np.abs(profile[1:])
@@ -168,14 +180,12 @@ class Explorer:
         assert found.pitch is not None
         grid = Grid(found.image.shape, found.pitch)
         truth = np.asarray(plane.sample(grid, magnification=1.0))
-        chosen = select_model(camera, tolerance=_TOLERANCE, **light)
         rows, columns = camera.sensor.shape
         lines = (
             f"{'Four captures' if scanned else 'One capture'} of {rows}×{columns} pixels at "
             f"{_SNR_DB:g} dB, {'fringe scanning' if scanned else 'Wiener filter'}: "
             f"{psnr(found.image, truth):.1f} dB.",
-            f"A PSF within {_TOLERANCE:.0%}: model {chosen.method.model}, predicted error "
-            f"{chosen.predicted_error:.1e}.",
+            *self._about_the_psf(camera, light),
         )
         pictures = {
             "capture": _stretched(np.asarray(noisy[0])),
@@ -183,6 +193,29 @@ class Explorer:
         }
         files = {name: _file(image, True) for name, image in pictures.items()}
         return replace(seen, pictures=seen.pictures | files, zero=_zero(camera, light), lines=lines)
+
+    def _about_the_psf(self, camera: LenslessCamera, light: dict[str, Any]) -> list[str]:
+        """What a cheaper model changes, and the angle."""
+        tolerance = self.values["tolerance"]
+        chosen = select_model(
+            camera, tolerance=tolerance * _TOLERANCE.scale, pixel_integration=True, **light
+        )
+        method = PsfMethod(pixel_integration=True)
+        h = psfs.psf(camera, model=method, **light)
+        other = psfs.psf(camera, model=chosen.method, **light)
+        found = [
+            f"A PSF within {tolerance:.3g} %: model {chosen.method.model}, predicted error "
+            f"{chosen.predicted_error:.1e}; from the one drawn it differs by "
+            f"{relative_error(other, h):.2g}."
+        ]
+        if any(self.at):
+            off = psfs.psf_about_ray(camera, **light, at=self.at, method=method)
+            angle = self.values["angle"]
+            found.append(
+                f"PSF and transfer function are about the ray at {angle:.3g}°, "
+                f"{relative_error(off, h):.2g} from the axis'; capture and image are of the axis."
+            )
+        return found
 
     def _placed(self, camera: LenslessCamera, distance: float) -> tuple[ImagePlane, Any]:
         """The scene at a distance, and the pixels of its image (y, x)."""
@@ -203,7 +236,8 @@ def _controls_of(camera: LenslessCamera) -> list[Control]:
         if isinstance(converter, Quantity) and isinstance(value, jax.Array) and value.ndim == 0:
             found.append(_control(field.name, converter, float(value)))
     distance = {field.name: field for field in dataclasses.fields(camera)}["distance"]
-    return [*found, _control("distance", distance.metadata["converter"], float(camera.distance))]
+    found.append(_control("distance", distance.metadata["converter"], float(camera.distance)))
+    return [*found, _ANGLE] if has_few_terms(camera.mask) else found
 
 
 def _control(name: str, quantity: Quantity, value: float) -> Control:
@@ -237,11 +271,21 @@ def _with_numbers(camera: LenslessCamera, numbers: dict[str, Any]) -> LenslessCa
     return camera
 
 
-@eqx.filter_jit
+def _point(numbers: dict[str, Any]) -> tuple[float, Any]:
+    """(y, x) of the object's point at an angle along x."""
+    angle = numbers.get("angle", 0.0)
+    tangent = math.tan(angle) if isinstance(angle, float) else jnp.tan(angle)
+    return 0.0, numbers["object_distance"] * tangent
+
+
 def _moving(camera: LenslessCamera, numbers: dict[str, Any]) -> tuple[Any, Any]:
     """The PSF as 256 grey levels, and the OTF along u ≥ 0 at v = 0."""
     light: dict[str, Any] = {name: numbers[name] for name in ("wavelength", "object_distance")}
-    h = psfs.psf(_with_numbers(camera, numbers), pixel_integration=True, **light)
+    camera, averages = _with_numbers(camera, numbers), PsfMethod(pixel_integration=True)
+    if "angle" in numbers:
+        h = psfs.psf_about_ray(camera, **light, at=_point(numbers), method=averages)
+    else:
+        h = psfs.psf(camera, model=averages, **light)
     largest = jnp.max(h)
     levels = jnp.round(255 * h / jnp.where(largest > 0, largest, 1)).astype(jnp.uint8)
     # The spectrum along u is that of the sum over y; its phase about the middle pixel.

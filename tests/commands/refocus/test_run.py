@@ -33,6 +33,7 @@ def run(tmp_path_factory):
     return study, folder.path, metrics, texts
 
 
+@pytest.mark.thorough
 def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
     result, metrics = tiny_refocus.study().run(), run[2]
     assert metrics["objects"] == {name: asdict(one) for name, one in result.objects.items()}

@@ -46,6 +46,7 @@ def draw(camera, images, seed=0, **options):
     return draw_batch(jax.random.key(seed), images, camera, SceneOptions(**options), size=2)
 
 
+@pytest.mark.thorough
 def test_planes_are_the_exact_psfs(camera):
     """What is cut off beside the mask's shadow is little."""
     planes, thin = Planes(camera), camera.camera

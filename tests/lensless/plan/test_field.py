@@ -91,6 +91,7 @@ def wide(planes: int, colours: int):
     return camera, tc.Scene(found[:planes], tc.Spectrum(np.linspace(500, 560, colours) * nm))
 
 
+@pytest.mark.thorough
 def test_a_wide_field_has_the_light_of_every_point():
     """Nothing else is needed at 3 %, where the axis is 7 % off."""
     camera, scene = wide(1, 1)

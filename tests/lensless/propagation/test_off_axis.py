@@ -52,15 +52,18 @@ def seen(mask, angle, azimuth, distance, **how):
     return np.asarray(h, float)
 
 
-def direct(mask, angle, azimuth, distance):
-    """The same by the sum over the mask, which lies on the axis, and where the ray meets."""
+def direct(mask, angle, azimuth, distance, every=1):
+    """The same by the sum over the mask, which lies on the axis, and where the ray meets.
+
+    At every so-manieth pixel of each axis.
+    """
     tangent = tangents(angle, azimuth)
     at = tangent if distance == INF else distance * tangent
     own = mask()
     path = tc.LenslessCamera(own, SENSOR, DISTANCE).path(500 * nm, distance, at)
     moved = DISTANCE * tangent / np.asarray(SENSOR.pitch)
     rows, columns = (
-        np.arange(n) - (n - 1) / 2 - m for n, m in zip(SENSOR.shape, moved, strict=True)
+        np.arange(0, n, every) - (n - 1) / 2 - m for n, m in zip(SENSOR.shape, moved, strict=True)
     )
     points = SparseGrid(rows, columns, SENSOR.pitch)
     return np.abs(_field(own, path, points)) ** 2 * (1 + DISTANCE / distance) ** 2
@@ -86,10 +89,11 @@ def _field(mask, path, points):
 )
 def test_closed_form_against_the_direct_sum(angle, azimuth, distance):
     """2 to 5 %, as on the axis; the axis' PSF is 11 to 16 % off."""
-    exact = direct(plate, angle, azimuth, distance)
-    error = relative(seen(plate, angle, azimuth, distance), exact)
+    exact = direct(plate, angle, azimuth, distance, every=2)
+    own, axis = (seen(plate, *where, distance)[::2, ::2] for where in ((angle, azimuth), (0, 0)))
+    error = relative(own, exact)
     assert error < 0.06
-    assert error < relative(seen(plate, 0, 0, distance), exact) / 2
+    assert error < relative(axis, exact) / 2
 
 
 @pytest.mark.thorough
@@ -215,7 +219,7 @@ def test_single_precision(at):
     assert relative(np.asarray(single, float), exact) < 1e-4
 
 
-@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize("averaged", [pytest.param(False, marks=pytest.mark.thorough), True])
 def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged):
     camera, at = camera_of(), np.array([5.0, 7.0])
     light = {"wavelength": np.float64(500 * nm), "object_distance": 100.0}

@@ -97,6 +97,7 @@ def test_slopes_and_batches():
     np.testing.assert_allclose(both, one_by_one, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_masks_of_many_terms_take_it():
     """With a word on its accuracy once; a number of points that is given says it is known."""
     camera = camera_of(tc.SampledMask(RANDOM.integers(0, 2, (130, 141)), 5 * um))

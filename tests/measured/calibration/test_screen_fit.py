@@ -99,7 +99,11 @@ def test_the_smear_is_in_the_model():
             "slant and shrinkage cannot be told apart",
             marks=pytest.mark.thorough,
         ),
-        (("tilt", "film_thickness"), "do not see film_thickness at all"),
+        pytest.param(
+            ("tilt", "film_thickness"),
+            "do not see film_thickness at all",
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_undetermined_parameters_are_named(names, reason):
