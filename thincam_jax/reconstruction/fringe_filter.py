@@ -44,6 +44,7 @@ class FringeFilter(eqx.Module):
 
     inverse: Complex[Array, "v u"]
     weights: Complex[Array, " capture"]
+    light: Float[Array, "m n"]
     object_pitch: Float[Array, ""]
     sensor_shape: tuple[int, int] = eqx.field(static=True)
     field_shape: tuple[int, int] = eqx.field(static=True)
@@ -62,6 +63,7 @@ class FringeFilter(eqx.Module):
         grid = Grid(padded, sensor.pitch)
         self.inverse = _inverse_filter(grid, beta, magnification, camera.mask.centre)
         self.weights = jnp.asarray(weights, self.inverse.dtype)
+        self.light = cameras.light(self.field_shape).astype(sensor.pitch.dtype)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
 
     def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
@@ -86,7 +88,7 @@ class FringeFilter(eqx.Module):
         # Sample j of the field is sample j + (sensor − field)/2 of the sensor.
         shift = [(f - s) // 2 for f, s in zip(self.field_shape, self.sensor_shape, strict=True)]
         field = jnp.roll(full, shift, axis=(0, 1))[: self.field_shape[0], : self.field_shape[1]]
-        return field[::-1, ::-1]
+        return field[::-1, ::-1] / self.light
 
 
 class FringeScanning(AbstractSolver):

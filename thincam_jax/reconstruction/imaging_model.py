@@ -17,7 +17,8 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import unchecked
 from thincam_jax.imaging.operators import LowRank, kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.field import field_fit
+from thincam_jax.lensless.field import field_fit, tangents_of
+from thincam_jax.lensless.light import light_over_field
 from thincam_jax.lensless.method import MODELS, Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import psf
 
@@ -59,7 +60,8 @@ class Cameras(Module):
       outside. Its pixels are p·t/d apart on the object, d the largest distance.
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`. With
       `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
-      (`field_operator`), for solvers by iteration of cameras at one distance.
+      (`field_operator`), for solvers by iteration of cameras at one distance. Filters take the
+      PSF of the axis, and divide the image by the light.
 
     ```python
     import thincam_jax as tc
@@ -118,6 +120,13 @@ class Cameras(Module):
     def over_field(self) -> bool:
         """Whether every point of the field has its own PSF."""
         return isinstance(self.model, PsfMethod) and self.model.field_tolerance is not None
+
+    def light(self, field: tuple[int, int]) -> Float[Array, "m n"]:
+        """Of the points of a field, 1 on the axis; without a `field_tolerance` everywhere."""
+        if not self.over_field:
+            return jnp.ones(field)
+        furthest = max(self.cameras, key=lambda c: float(c.distance))
+        return jnp.asarray(light_over_field(furthest.sensor, *tangents_of(furthest, field)))
 
     def field_operators(self, field: tuple[int, int]) -> tuple[LowRank, ...]:
         """The operator of each camera over its field, from the object as it lies on the sensor."""

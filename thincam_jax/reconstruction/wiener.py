@@ -63,6 +63,10 @@ class WienerSynthesis(eqx.Module):
     captures, the steps at the sensor's borders are counted as noise (`crop_noise`); a
     single capture therefore loses its lowest frequencies, which synthesised ones do not.
 
+    With a `field_tolerance` the image is divided by the light of every point. A filter of its own
+    for each of 3×3 or 5×5 parts of the field, each with its PSF, gains nothing beyond (±14° and
+    ±24°, β = 12 and 20 rad/mm², 30 and 40 dB: within 0.03 dB).
+
     Differentiable in all numbers of the cameras but the distances, which set array sizes.
 
     **Arguments**
@@ -81,6 +85,7 @@ class WienerSynthesis(eqx.Module):
     uniform: Float[Array, "capture y x"]
     prior: Float[Array, "v u"]
     synthesis: Float[Array, "channel capture"]
+    light: Float[Array, "m n"]
     object_pitch: Float[Array, ""]
     ratios: tuple[float, ...] = eqx.field(static=True)
     weights: tuple[tuple[float, ...], ...] = eqx.field(static=True)
@@ -128,6 +133,7 @@ class WienerSynthesis(eqx.Module):
         )
         self.prior = prior_spectrum(prior, Grid(self.padded, sensor.pitch), self.field_shape)
         self.synthesis = jnp.asarray(matrix, dtype=self.uniform.dtype)
+        self.light = cameras.light(self.field_shape).astype(self.uniform.dtype)
         self.weights = tuple(map(tuple, matrix.tolist()))
         self.object_pitch = cameras.pitch
 
@@ -171,7 +177,7 @@ class WienerSynthesis(eqx.Module):
         gain = jnp.sum(jnp.abs(self.spectra) ** 2 / density, axis=0) + 1 / scene
         merged = jnp.sum(self.spectra.conj() * spectra / density.astype(spectra.dtype), axis=0)
         full = jnp.fft.irfft2(merged / gain.astype(merged.dtype), s=self.padded)
-        return crop_field(full, self.field_shape)[::-1, ::-1] + mean
+        return (crop_field(full, self.field_shape)[::-1, ::-1] + mean) / self.light
 
     def _noise_and_scene(self, spectra, noise, pixels: int):
         """η_c of every channel and η_f, from the noise's variance and the channels' own power."""
@@ -243,11 +249,6 @@ def require_cameras(recording: Recording, method: str) -> Cameras:
         raise ValueError(
             f"method {method!r} needs cameras; with measured PSFs or operators use AdmmTV, Fista, "
             "Ridge or PoissonTV"
-        )
-    if recording.imaging_model.over_field:
-        raise ValueError(
-            f"method {method!r} takes the PSF of the axis everywhere; leave the cameras' "
-            "field_tolerance out, or use AdmmTV, Fista, Ridge or PoissonTV"
         )
     if recording.valid is not None:
         raise ValueError(
