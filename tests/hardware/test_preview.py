@@ -9,6 +9,7 @@ import pytest
 import tifffile
 from hardware.memory_rig import SETTINGS, World, fiducial_plan
 
+from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import Frame
 from thincam_jax.hardware.preview import FrameNumbers, Preview
 
@@ -94,14 +95,19 @@ def test_a_kept_frame_has_its_counts_and_where_they_come_from(world, tmp_path):
         assert known["position_mm"] == 0.0
 
 
-@pytest.mark.parametrize("fault", ["dropped_frame", "nak", "unplug"])
-def test_a_device_that_fails_is_told_of_and_used_again(world, fault):
+@pytest.mark.parametrize(
+    ("fault", "role"),
+    [("dropped_frame", "camera"), ("nak", "camera"), ("unplug", "camera"), ("unplug", "display")],
+)
+def test_a_device_that_fails_is_told_of_and_used_again(world, fault, role):
+    procedure = Procedure(timeout=0.001, reopen_wait=0.0)
     with world.rig(stage=False) as rig:
-        preview = Preview(rig, fiducial_plan(1, stage=False))
+        preview = Preview(rig, fiducial_plan(2, stage=False), procedure)
         preview.view()
-        world.unplugs = "camera"
+        world.unplugs = role
         world.faults.inject(fault)
-        preview.turn({"exposure": 11.0})
+        preview.turn({"exposure": 11.0, "pattern": 1.0})
         (line,) = preview.view().lines
-        assert line.startswith("camera: ")
+        assert line.startswith(f"{role}: ")
         assert "frame" in preview.view().pictures
+        assert world.opened[role] == (2 if fault == "unplug" else 1)

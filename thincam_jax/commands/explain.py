@@ -164,9 +164,9 @@ def _frames(asked: Any, setup: Any) -> Iterator[str]:
     """Of a capture: frames, and the time that they are exposed."""
     from thincam_jax.commands.capture.command import build_plan
 
-    frames = len((build_plan(asked) if setup is None else setup).steps)
-    seconds = frames * asked.camera.exposure
-    yield f"{frames} frames, exposed for {seconds:.3g} s in all"
+    plan = build_plan(asked) if setup is None else setup
+    seconds = sum(plan.settings[step.settings].exposure for step in plan.steps)
+    yield f"{len(plan.steps)} frames, exposed for {seconds:.3g} s in all"
 
 
 def _lessons(asked: Any, setup: Any) -> Iterator[str]:

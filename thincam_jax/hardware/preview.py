@@ -10,18 +10,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tifffile
 
 from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.files import write_whole
-from thincam_jax.hardware.acquisition.plan import Plan
+from thincam_jax.hardware.acquisition.plan import Plan, Step
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.acquisition.taker import full_scale
-from thincam_jax.hardware.base import Frame
-from thincam_jax.hardware.errors import Disconnected, HardwareError
+from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
+from thincam_jax.hardware.base import CameraSettings, Frame
+from thincam_jax.hardware.errors import HardwareError
 from thincam_jax.imaging.display import jpeg_bytes
 
 _LONGEST = 900  # pixels of the longer side of a shown frame
@@ -87,11 +86,11 @@ class Preview:
 
     - `rig`: its devices, open. `plan`: whose patterns are shown, and whose first settings it begins
       with.
-    - `settle`: s from showing a pattern to the frame. `timeout`: s, beyond the exposure.
+    - `procedure`: settle time and timeout, as of an acquisition; nothing is tried again.
     - `image`: what is reconstructed of a frame (y, x) of the first pattern, as levels 0 to 1.
     - `folder`: of the frames that are kept.
 
-    The error of a device is shown as a line; an unplugged camera is opened again.
+    The error of a device is shown as a line; an unplugged one is opened again.
     """
 
     captions = {
@@ -105,15 +104,16 @@ class Preview:
         self,
         rig: Rig,
         plan: Plan,
+        procedure: Procedure | None = None,
         *,
-        settle: float = 0.0,
-        timeout: float = 2.0,
         image: Callable[[np.ndarray], np.ndarray] | None = None,
         folder: Path | None = None,
     ):
-        self.rig, self.plan, self.settle, self.timeout = rig, plan, settle, timeout
+        self.rig, self.plan = rig, plan
+        self.taker = Taker(plan, rig, dataclasses.replace(procedure or Procedure(), retries=0))
         self.image, self.folder = image, folder or Path("frames")
         self.settings = plan.settings[0]
+        self._asked: CameraSettings | None = None
         if image is None:
             self.captions = {k: v for k, v in self.captions.items() if k != "image"}
         exposure = 1000 * self.settings.exposure
@@ -130,23 +130,24 @@ class Preview:
             controls.append(Control("position", "stage", "mm", low, high, place))
         self.controls = tuple(controls)
         self.values = {one.name: one.value for one in controls}
-        self._set: dict[str, Any] = {}  # what the devices have
+        self._position: float | None = None  # the stage stays where it is until it is turned
         self._best, self._seen = 0.0, time.monotonic()
         self._rate = 0.0
 
     def turn(self, values: dict[str, float]) -> None:
         """Set controls, each within its range; ValueError names one that does not exist."""
+        before = self.values.get("position")
         self.values |= turned(self.controls, values)
+        if self.values.get("position") != before:
+            self._position = self.values["position"]
 
     def view(self, *, rest: bool = False) -> FrameView:
         """The next frame; `rest` keeps it in the folder."""
         try:
             frame = self._frame()
         except HardwareError as error:
-            if isinstance(error, Disconnected):
-                self._set.clear()
-                with suppress(HardwareError):
-                    self.rig.reopen("camera")
+            with suppress(HardwareError):
+                self.taker.recover(error)
             return FrameView({}, dict(self.values), (str(error),), np.zeros(0))
         numbers = FrameNumbers.of(frame)
         now = time.monotonic()
@@ -172,24 +173,12 @@ class Preview:
 
     def _frame(self) -> Frame:
         """With the devices set to the controls; only what has changed is set."""
-        rig, values = self.rig, self.values
-        if rig.stage is not None and self._set.get("position") != values["position"]:
-            if self._set:  # it stays where it is until it is turned
-                rig.stage.move_to(values["position"])
-            self._set["position"] = values["position"]
-        if self._set.get("pattern") != self._pattern:
-            rig.display.show(rig.render(self.plan.patterns[self._pattern]))
-            self._set["pattern"] = self._pattern
-            time.sleep(self.settle)
-        asked = dataclasses.replace(
-            self.settings, exposure=values["exposure"] / 1000, gain=values["gain"]
-        )
-        if self._set.get("settings") != asked:
-            rig.camera.configure(asked)
-            self._set["settings"] = asked
-        rig.camera.flush()
-        frame = rig.camera.trigger_and_grab(self.timeout)
-        return dataclasses.replace(frame, pixels=np.array(frame.pixels))
+        turned_to = {"exposure": self.values["exposure"] / 1000, "gain": self.values["gain"]}
+        asked = dataclasses.replace(self.plan.settings[0], **turned_to)
+        if asked != self._asked:
+            self.settings, self._asked = self.taker.set_near(asked), asked
+        step = Step(self._pattern, self._position)
+        return self.taker.take(step, self.settings, probe=True)[0]
 
     def _keep(self, frame: Frame) -> Path:
         """A TIFF of the counts, with where they come from as its description."""
@@ -197,7 +186,7 @@ class Preview:
         known = {
             "time": when.isoformat(),
             "devices": {role: str(one) for role, one in self.rig.identities().items()},
-            "settings": dataclasses.asdict(self._set["settings"]),
+            "settings": dataclasses.asdict(self.settings),
             "pattern": self.plan.patterns[self._pattern].label,
             "position_mm": self.values.get("position"),
             "number": int(frame.number),

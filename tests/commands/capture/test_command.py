@@ -148,6 +148,25 @@ def test_after_ctrl_c_the_store_is_kept_and_goes_on(method_b, tmp_path, monkeypa
     assert all(np.array_equal(first.frame(n), second.frame(n)) for n in lit[1:])
 
 
+def test_the_exposure_is_found_before_the_first_frame_and_kept(tmp_path):
+    """From three times too long a start; the same when it goes on."""
+    raw = yaml.safe_load(tiny.METHOD_B) | {"acquisition": {"exposure": "auto"}}
+    raw["camera"]["exposure"] = "150 ms"
+    file, store = tiny.write(tmp_path, yaml.safe_dump(raw)), tmp_path / "a.zarr"
+    result = call("capture", file, "--out", store)
+    assert result.exit_code == 0, result.output
+    taken = read_acquisition(store)
+    exposure = taken.settings[0].exposure
+    assert f"6 frames; exposure {1000 * exposure:.4g} ms; next: thincam run" in " ".join(
+        result.stdout.split()
+    )
+    level = np.quantile(taken.frame(taken.lit[0]), 0.999) / 4095
+    assert exposure < 0.1 and level == pytest.approx(0.7, rel=0.15)
+    assert all(shot["exposure"] == pytest.approx(exposure, rel=1e-3) for shot in taken.shots)
+    assert call("capture", file, "--out", store, "--resume").exit_code == 0
+    assert read_acquisition(store).settings[0].exposure == exposure
+
+
 def test_an_error_of_a_device_is_one_line_and_how_to_go_on(tmp_path):
     file = tiny.write(tmp_path)
     store = tmp_path / "a.zarr"
@@ -204,6 +223,7 @@ def test_the_limits_of_a_rig_hold_for_the_whole_plan_before_the_first_frame(aske
         ("targets=[]", "targets: a virtual rig looks at one; give it"),
         ("optics=null", "optics: a plan of kind method_b needs optics"),
         ("camera.exposure=20", "camera.exposure: 20 has no unit"),
+        ("acquisition.exposure=found", "'found' is unknown; choose one of 'given' or 'auto'"),
     ],
 )
 def test_a_file_that_does_not_fit_together(asked, line, tmp_path):

@@ -8,6 +8,7 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
+from hardware.displays.rig import Clock, Panel, PanelCamera
 from hardware.memory_rig import (
     SETTINGS,
     SHAPE,
@@ -22,6 +23,7 @@ from hardware.memory_rig import (
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
 from thincam_jax._core.files import WriteError
 from thincam_jax.hardware import (
+    CameraSettings,
     Disconnected,
     Frame,
     IncompleteFrame,
@@ -30,12 +32,13 @@ from thincam_jax.hardware import (
     Region,
     Timeout,
 )
-from thincam_jax.hardware.acquisition import recorder
+from thincam_jax.hardware.acquisition import recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
-from thincam_jax.hardware.acquisition.plan import hadamard
+from thincam_jax.hardware.acquisition.plan import hadamard, pictures
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
+from thincam_jax.hardware.displays import settle
 from thincam_jax.hardware.errors import OutOfRange, ProtocolError, Saturated
 from thincam_jax.measured.calibration import (
     HadamardSeries,
@@ -280,21 +283,55 @@ def test_the_same_capture_twice_is_refused(path, monkeypatch):
 
 def test_the_exposure_is_found_once(path):
     wanted = AutoExposure(target=0.3, longest=0.05)
-    procedure = dataclasses.replace(QUICK, auto_exposure=wanted)
+    procedure = dataclasses.replace(QUICK, exposure="auto", auto_exposure=wanted)
     world = World()
     world.light = 40.0
     run(world, path, procedure=procedure, progress=stop_after(4))
-    run(world, path, procedure=procedure)
+    world.light = 60.0  # the exposure that was found is kept
+    found = run(world, path, procedure=procedure).found
     taken = read_acquisition(path)
+    assert found == (f"exposure {1000 * taken.settings[0].exposure:.4g} ms",)
     assert 1e-5 < taken.settings[0].exposure < 0.001
-    assert np.quantile(taken.frame(3), 0.999) / 4095 == pytest.approx(0.3, rel=0.1)
+    assert np.quantile(taken.frame(1), 0.999) / 4095 == pytest.approx(0.3, rel=0.1)
     for light, error in ((1e-3, OutOfRange), (1e9, Saturated)):
         world.light = light
         with pytest.raises(error, match="find the exposure: level .*0.3 wanted; change the light"):
             run(world, path.with_name("b"), procedure=procedure)
-    two = dataclasses.replace(PLAN, settings=(SETTINGS, SETTINGS))
-    with pytest.raises(ValueError, match="has 2 settings; auto-exposure takes plans with one"):
-        run(world, path.with_name("c"), two, procedure)
+    world.light = 10.0
+    longer = dataclasses.replace(SETTINGS, exposure=3 * SETTINGS.exposure)
+    run(
+        world,
+        path.with_name("c"),
+        dataclasses.replace(PLAN, settings=(SETTINGS, longer)),
+        procedure,
+    )
+    first, second = read_acquisition(path.with_name("c")).settings
+    assert first.exposure < 0.003
+    assert second.exposure == pytest.approx(3 * first.exposure, rel=1e-3)
+
+
+def test_the_settle_time_is_measured_once(path, monkeypatch):
+    """Of a panel that follows exponentially: τ·ln(1/tolerance); a resumed run keeps it."""
+    clock = Clock()
+    for module in (settle, taker):
+        monkeypatch.setattr(module, "time", clock)
+    display = Panel(SHAPE, 0.02, clock)
+    camera = PanelCamera(display, lambda levels: 100.0 + 14.0 * levels)
+    levels = {"a": np.full(SHAPE, 200, np.uint8), "b": np.full(SHAPE, 90, np.uint8)}
+    plan = pictures(levels, CameraSettings(exposure=1e-3), frames=2)
+    procedure = dataclasses.replace(QUICK, settle=None)
+
+    def begin(progress=None):
+        render = lambda pattern: levels.get(pattern.label, np.zeros(SHAPE, np.uint8))  # noqa: E731
+        with Rig(lambda: camera, lambda: display, render) as rig:
+            return acquire(plan, rig, path, procedure=procedure, progress=progress)
+
+    assert not begin(stop_after(1)).complete
+    found = begin().found
+    known = read_acquisition(path).provenance["procedure"]["settle"]
+    assert 0.02 * np.log(100) <= known < 0.02 * np.log(100) + 0.5 / 8
+    assert found == (f"settle time {1000 * known:.3g} ms",)
+    assert abs(read_acquisition(path).frame(2).mean() - (100 + 14 * 90)) < 0.015 * 14 * 110
 
 
 def test_a_full_disk_stops_the_run(path, monkeypatch):

@@ -100,7 +100,8 @@ def capture(
         warn([f"recovered from {text}" for text in outcome.recovered])
         if not outcome.complete:
             raise KeyboardInterrupt
-    say_result("store", store, f"{store}: {outcome.total} frames; next: thincam run {store}")
+    made = "; ".join((f"{outcome.total} frames", *outcome.found))
+    say_result("store", store, f"{store}: {made}; next: thincam run {store}")
 
 
 def preview(
@@ -125,8 +126,8 @@ def preview(
                 if asked.optics is not None:
                     shape = (region.height, region.width) if region else rig.camera.sensor_shape
                     image = live_image(build_study(asked, shape), asked.optics.object.width)
-                timing = {"settle": asked.display.settle, "timeout": asked.acquisition.timeout}
-                serve_page(Preview(rig, plan, image=image, **timing), asked.name, port, browser)
+                procedure = asked.acquisition.build(settle=asked.display.settle)
+                serve_page(Preview(rig, plan, procedure, image=image), asked.name, port, browser)
         except HardwareError as error:
             tell(str(error))
             raise typer.Exit(STOPPED) from None
@@ -290,4 +291,5 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         simulated,
         darks,
         hadamard,
+        [one.exposure for one in found.settings],
     )

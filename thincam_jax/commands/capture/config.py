@@ -6,7 +6,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import Length, Section, Time, Wavelength, section
+from thincam_jax.commands.schema import Length, Section, Wavelength, section
 from thincam_jax.commands.screen.config import (
     ScreenMethodConfig,
     ScreenTargetConfig,
@@ -47,21 +47,18 @@ class CameraConfig(DeviceConfig, section(CameraSettings), section(Sensor, only=(
 class DisplayConfig(
     DeviceConfig,
     section(FresnelZoneAperture, only=("fill_factor",)),
-    section(Procedure, only=("settle",)),
+    section(Procedure, only=("settle",), defaults={"settle": None}),
 ):
-    """The modulator or monitor; `pitch`: of its pixels; `settle`: until it shows a pattern."""
+    """The modulator or monitor; `pitch`: of its pixels; `settle`: left out, it is measured."""
 
     pitch: Length
-    settle: Time
 
 
 class PlanConfig(section(PlanRequest)):
     """`thincam_jax.hardware.acquisition.PlanRequest`."""
 
 
-class AcquisitionConfig(
-    section(Procedure, only=("timeout", "retries", "saturated"), defaults={"saturated": 0.01})
-):
+class AcquisitionConfig(section(Procedure, only=("exposure", "timeout", "retries", "saturated"))):
     """How frames are taken; see `thincam_jax.hardware.acquisition.Procedure`."""
 
 

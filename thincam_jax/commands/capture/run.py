@@ -57,7 +57,7 @@ class Taken:
     - `frames`: (capture, y, x) counts without the mean dark frame; of a Hadamard plan some only.
     - `labels`: what was shown for each. `seconds`: of the steps of the acquisition, by name.
     - `simulated`: of a virtual rig. `dark_frames`: whose mean was subtracted.
-    - `pixels`: the part of the sensor that was read, rows and columns.
+    - `pixels`: the part of the sensor that was read, rows and columns. `exposures`: s.
     """
 
     frames: np.ndarray
@@ -68,6 +68,7 @@ class Taken:
     simulated: CountingCamera | None = None
     dark_frames: int = 0
     hadamard: calibration.HadamardCaptures | None = None
+    exposures: list[float] = field(default_factory=list)
 
 
 def run_captures(
@@ -260,12 +261,11 @@ def page(
     images = f"What is reconstructed{beside_it if agreement else ''}."
     seen = "What the sensor sees of single cells (row, column)"
     seen += ": measured, and by direct simulation. " if agreement else ". "
-    devices = [f"display {config.display.driver}"]
-    devices += [f"stage {config.stage.driver}"] if config.stage else []
+    exposures = ", ".join(f"{1000 * one:g}" for one in taken.exposures)
+    devices = "; ".join(f"{role} {driver}" for role, (driver, _) in config.drivers.items())
     lead = (
-        f"Plan {config.plan.kind.replace('_', ' ')} on a {config.rig} rig: camera "
-        f"{config.camera.driver}, exposure {1000 * config.camera.exposure:g} ms; "
-        f"{'; '.join(devices)}.",
+        f"Plan {config.plan.kind.replace('_', ' ')} on a {config.rig} rig: {devices}; exposure "
+        f"{exposures} ms.",
         Picture("images.png", "Reconstructions", images),
         Picture("columns.png", "Columns of the system matrix", seen + _MATRIX),
         Picture("shown.png", "Patterns shown", "What the display showed."),

@@ -24,7 +24,7 @@ from thincam_jax._core.capture_store import (
 )
 from thincam_jax._core.text import of_error, shortened
 from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
-from thincam_jax.hardware.acquisition.plan import Plan, settings_from
+from thincam_jax.hardware.acquisition.plan import BLACK, Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
     Recorder,
     create_store,
@@ -36,6 +36,7 @@ from thincam_jax.hardware.acquisition.recorder import (
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
 from thincam_jax.hardware.base import CameraSettings, Identity
+from thincam_jax.hardware.displays.settle import LONGEST, settle_calibrate
 from thincam_jax.hardware.errors import NotHomed, OutOfRange
 
 
@@ -54,6 +55,7 @@ class Outcome:
     """End of a run.
 
     - `done`, `total`: frames in the store, and of the plan.
+    - `found`: what was measured before the first frame: exposure, settle time.
     - `recovered`: the errors that a retry resolved, one line each.
     - `seconds`: spent on "move", "show", "settle", "flush", "trigger", "check", "keep".
     """
@@ -61,6 +63,7 @@ class Outcome:
     path: Path
     done: int
     total: int
+    found: tuple[str, ...] = ()
     recovered: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -94,7 +97,9 @@ def acquire(
         with Recorder(path) as recorder:
             todo, total = recorder.missing, len(run.steps)
             require_space(path, len(todo) * recorder.store.frame_bytes)
-            recorder.note({"begins": now(), "versions": versions(), "procedure": asdict(procedure)})
+            recorder.note(
+                {"begins": now(), "versions": versions(), "procedure": asdict(run.procedure)}
+            )
             done, started = total - len(todo), time.monotonic()
             for count, number in enumerate(todo, 1):
                 if stop.is_set():
@@ -107,7 +112,12 @@ def acquire(
                 if progress is not None:
                     rate = count / max(time.monotonic() - started, 1e-9)
                     progress(Progress(done, total, rate, (total - done) / rate))
-    return Outcome(path, done, total, tuple(run.recovered), run.seconds)
+    found = []
+    if procedure.exposure == "auto":
+        found.append(f"exposure {1000 * settings[0].exposure:.4g} ms")
+    if procedure.settle is None:
+        found.append(f"settle time {1000 * (run.procedure.settle or 0.0):.3g} ms")
+    return Outcome(path, done, total, tuple(found), tuple(run.recovered), run.seconds)
 
 
 def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
@@ -116,7 +126,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
         _require_stage(run, positions)
     if path.exists():
         return _resumed(run, path)
-    settings = _new_settings(run)
+    settings = _measured(run)
     shape, *others = {run.shape(one) for one in settings}
     if others:
         raise ValueError(
@@ -179,6 +189,9 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
         name, plan, start = str(begun["name"]), str(begun["plan"]), begun.get("start")
         devices = {role: Identity(**record) for role, record in begun["devices"].items()}
         settings = tuple(settings_from(record) for record in begun["settings"])
+        if run.procedure.settle is None:
+            settle = begun["procedure"]["settle"]
+            run.procedure = replace(run.procedure, settle=settle)
         run.steps = run.plan.placed(None if start is None else float(start))
     except Exception as error:  # whatever another's attributes bring about
         raise CaptureStoreError(
@@ -203,25 +216,33 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     return settings
 
 
-def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
-    """Camera settings nearest to the plan's, with the exposure found where that is wanted."""
-    asked, wanted = run.plan.settings, run.procedure.auto_exposure
-    if wanted is not None:
-        if len(asked) != 1:
-            raise ValueError(
-                f"the plan {run.plan.name!r} has {len(asked)} settings; auto-exposure takes "
-                "plans with one"
-            )
-        lit = next((s for s in run.steps if not s.dark), run.steps[0])
+def _measured(run: Taker) -> tuple[CameraSettings, ...]:
+    """Camera settings nearest to the plan's; exposure and settle time measured where asked for."""
+    asked, wanted, measured = run.plan.settings, run.procedure, run.procedure.settle is None
+    if measured:
+        run.procedure = replace(wanted, settle=LONGEST)
+    lit = next((s for s in run.steps if not s.dark), run.steps[0])
+    if wanted.exposure == "auto":
 
         def level_at(exposure: float) -> float:
             settings = run.persist(lambda: run.set_near(replace(asked[0], exposure=exposure)))
             frame, _ = run.take(lit, settings, probe=True)
-            return float(np.quantile(frame.pixels, wanted.quantile)) / full_scale(frame)
+            return float(np.quantile(frame.pixels, wanted.auto_exposure.quantile)) / full_scale(
+                frame
+            )
 
-        found = find_exposure(level_at, asked[0].exposure, wanted, run.name("camera"))
-        asked = (replace(asked[0], exposure=found),)
-    return tuple(run.persist(lambda one=one: run.set_near(one)) for one in asked)
+        start = asked[0].exposure
+        ratio = find_exposure(level_at, start, wanted.auto_exposure, run.name("camera")) / start
+        asked = tuple(replace(one, exposure=ratio * one.exposure) for one in asked)
+    settings = tuple(run.persist(lambda one=one: run.set_near(one)) for one in asked)
+    if measured:
+        run.persist(lambda: run.configure(settings[0]))
+        patterns = run.rig.render(BLACK), run.rig.render(run.plan.pattern(lit))
+        given = {"longest": LONGEST, "timeout": wanted.timeout}
+        found = settle_calibrate(run.rig.display, run.rig.camera, patterns, **given)
+        run.forget()
+        run.procedure = replace(wanted, settle=found.time)
+    return settings
 
 
 @contextmanager

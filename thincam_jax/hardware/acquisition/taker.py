@@ -1,7 +1,8 @@
 """Taking the frame of one step: move, show, settle, flush, trigger, check.
 
-After a transient error the step is repeated from its beginning, and a disconnected device is
-reopened; every other error is the caller's.
+A pattern that stands on the display already is not shown again. After a transient error the step is
+repeated from its beginning, and a disconnected device is reopened; every other error is the
+caller's.
 """
 
 import math
@@ -9,11 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from thincam_jax._core.quantity import check_fields, quantity, whole
+from thincam_jax._core.quantity import check_fields, choice, quantity, whole
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.plan import Plan, Step
 from thincam_jax.hardware.acquisition.rig import Rig, Role
@@ -38,22 +39,24 @@ _SECONDS = quantity("s", non_negative=True)
 class Procedure:
     """Timing, checks and error recovery of an acquisition.
 
-    - `settle`: s from showing a pattern to the trigger.
+    - `settle`: s from showing a pattern to the trigger; None: measured before the first frame.
     - `timeout`: s, beyond the exposure, that a frame may take.
     - `retries`: repetitions of a step after IncompleteFrame, Timeout and Disconnected.
     - `reopen_wait`: s before a disconnected device is reopened.
     - `saturated`: largest allowed share of saturated pixels.
     - `position_tolerance`: mm between the commanded position and the one reached.
-    - `auto_exposure`: find the exposure before the first frame; None: use the plan's.
+    - `exposure`: as "given" with the plan, or found before the first frame, "auto": the first
+      settings' by the search `auto_exposure`; the others keep their ratio to it.
     """
 
-    settle: Annotated[float, _SECONDS] = 0.0
+    settle: Annotated[float | None, quantity("s", non_negative=True, optional=True)] = 0.0
     timeout: Annotated[float, _SECONDS] = 2.0
     retries: Annotated[int, whole(0, 100)] = 3
     reopen_wait: Annotated[float, _SECONDS] = 0.5
-    saturated: Annotated[float, quantity(least=0.0, most=1.0)] = 1e-3
+    saturated: Annotated[float, quantity(least=0.0, most=1.0)] = 0.01
     position_tolerance: Annotated[float, quantity("mm", non_negative=True)] = 0.01
-    auto_exposure: AutoExposure | None = None
+    exposure: Annotated[Literal["given", "auto"], choice(("given", "auto"))] = "given"
+    auto_exposure: AutoExposure = AutoExposure()
 
     def __post_init__(self):
         check_fields(self)
@@ -73,7 +76,7 @@ class Taker:
         self.seconds: dict[str, float] = {}
         self.identities = rig.identities()
         self._role: Role = "camera"  # of the device in use
-        self._forget()
+        self.forget()
         self.bits: int | None = None  # of every frame, from the first
         self._seen: tuple[int, np.ndarray] | None = None  # pattern and pixels of the last frame
 
@@ -114,11 +117,11 @@ class Taker:
             except TRANSIENT as error:
                 if not left:
                     raise
-                self._recover(error)
+                self.recover(error)
                 self.recovered.append(f"{type(error).__name__}: {error}")
         raise AssertionError  # for the type: the last attempt returns or raises
 
-    def _recover(self, error: HardwareError) -> None:
+    def recover(self, error: HardwareError) -> None:
         """Prepare the devices for repeating the step from its beginning."""
         role = self._role
         if isinstance(error, Disconnected):
@@ -126,7 +129,7 @@ class Taker:
         elif isinstance(error, Timeout) and role == "camera":
             time.sleep(self.procedure.timeout)  # a late frame arrives now, and is flushed
         last = None if role == "camera" and isinstance(error, Disconnected) else self._last
-        self._forget()
+        self.forget()
         self._last = last
 
     def _reopen(self, role: Role, error: Disconnected) -> None:
@@ -145,10 +148,11 @@ class Taker:
             return
         raise error from failure
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
         """Forget the devices' state, so that all is set again."""
         self._last: int | None = None  # number of the last frame
         self._configured: CameraSettings | None = None
+        self._shown: int | None = None  # number of the pattern
         self._asked: float | None = None  # commanded position of the stage, and the reported one
         self._position: float | None = None
 
@@ -157,16 +161,18 @@ class Taker:
     ) -> tuple[Frame, dict[str, Any]]:
         """Frame of a step, its number of saturated pixels, and the stage's position."""
         position = self._moved(step)
-        with self.clock("show"):
-            levels = self.rig.render(self.plan.pattern(step))
-            self._role = "display"
-            self.rig.display.show(levels)
+        if shown := step.pattern != self._shown:
+            with self.clock("show"):
+                levels = self.rig.render(self.plan.pattern(step))
+                self._role, self._shown = "display", None
+                self.rig.display.show(levels)
         self._role = "camera"
         camera = self.rig.camera
         self.configure(settings)
-        if self.procedure.settle:
+        if shown and self.procedure.settle:
             with self.clock("settle"):
                 time.sleep(self.procedure.settle)
+        self._shown = step.pattern
         with self.clock("flush"):
             camera.flush()
         with self.clock("trigger"):
@@ -215,7 +221,8 @@ class Taker:
     def set_near(self, settings: CameraSettings) -> CameraSettings:
         """Apply settings; returns the camera's nearest."""
         self._role, self._configured = "camera", None
-        return self.rig.camera.configure(settings)
+        self._configured = self.rig.camera.configure(settings)
+        return self._configured
 
     def _refuse_repeated(self, step: Step, pixels: np.ndarray) -> None:
         """Refuse identical pixels for another pattern: with new noise they would differ."""

@@ -17,6 +17,7 @@ import numpy as np
 from thincam_jax.hardware.base import Camera, Display
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
+LONGEST = 0.5  # s, after which a display counts as settled
 _SHOTS = 4  # of each measured fraction
 _SWEEP = 8  # delays before bisection, which follow a ringing response to its end
 _BISECTIONS = 5
@@ -46,7 +47,7 @@ def settle_calibrate(
     patterns: tuple[np.ndarray, np.ndarray] | None = None,
     *,
     tolerance: float = 0.01,
-    longest: float = 0.5,
+    longest: float = LONGEST,
     timeout: float = 1.0,
 ) -> SettleTime:
     """Find the settle time, from the return of `show` to the call of `trigger_and_grab`, in s.
