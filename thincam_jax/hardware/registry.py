@@ -30,6 +30,7 @@ _BUILT_IN = {
     "displays": {
         "sdl": "thincam_jax.hardware.displays.sdl:SdlDisplay",
         "tkinter": "thincam_jax.hardware.displays.tkinter:TkinterDisplay",
+        "shutter": "thincam_jax.hardware.displays.shutter:Shutter",
     },
 }
 KINDS = tuple(_BUILT_IN)

@@ -2,6 +2,9 @@
 
 from thincam_jax.measured.bayer import demosaic as demosaic
 from thincam_jax.measured.bayer import demosaic_mask as demosaic_mask
+from thincam_jax.measured.exposures import ExposedFrames as ExposedFrames
+from thincam_jax.measured.exposures import MergedExposures as MergedExposures
+from thincam_jax.measured.exposures import merge_exposures as merge_exposures
 from thincam_jax.measured.options import Preparation as Preparation
 from thincam_jax.measured.preparation import Prepared as Prepared
 from thincam_jax.measured.preparation import prepare as prepare

@@ -101,18 +101,20 @@ def live_image(study: Study, width: float) -> Callable[[Float[np.ndarray, "y x"]
 
 @dataclass(frozen=True, eq=False)
 class RigFrames:
-    """Frames of a rig, and the camera that took them.
+    """Frames of a rig, and the camera that took them, where it is known.
 
     - `frames`: counts without the mean of so many `dark_frames`.
     - `pixels`: part of the sensor that was read, rows and columns.
     - `lit`: pixels of that part that see light.
+    - `variance`: where the frames are means of several; infinite where a pixel is not known.
     """
 
     frames: Float[np.ndarray, "capture y x"]
-    camera: CountingCamera
+    camera: CountingCamera | None
     pixels: Pixels
     lit: Bool[np.ndarray, "y x"]
     dark_frames: int = 0
+    variance: Float[np.ndarray, "y x"] | None = None
 
 
 @dataclass(frozen=True)
@@ -146,17 +148,22 @@ def compare_frames(
     - `solve`: see `frame_solver`; `captured`: what it makes of the rig's frames.
     """
     camera, target = rig.camera, study.targets[0]
+    assert camera is not None
     clean = camera.counts * np.stack(
         [
             np.asarray(noise_free(study, exposure, target.plane))[rig.pixels]
             for exposure in study.methods[0].exposures
         ]
     )
-    variance, dark = camera.variance(clean), np.zeros(clean.shape[1:])
-    if rig.dark_frames:
+    variance, dark, lit = camera.variance(clean), np.zeros(clean.shape[1:]), rig.lit
+    if rig.variance is not None:
+        known = np.isfinite(rig.variance)
+        variance = np.where(known, rig.variance, np.median(rig.variance))[None]
+        lit = lit & known
+    elif rig.dark_frames:
         dark = camera.variance(dark) / rig.dark_frames
     residual = (rig.frames - clean - camera.offset) / np.sqrt(variance + dark)
-    of_each = residual[:, rig.lit]
+    of_each = residual[:, lit]
     random = np.random.default_rng(seed + 1)
 
     def simulated(noise: float) -> Reconstruction:

@@ -252,11 +252,14 @@ def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, t
     assert [step.position for step in command.build_plan(config).steps] == positions
 
 
-@pytest.mark.parametrize("name", ["rig_virtual", "rig_hadamard", "rig_pictures"])
-def test_shipped_files(name):
+@pytest.mark.parametrize(
+    ("name", "steps"),
+    [("rig_virtual", 5), ("rig_hadamard", 1032), ("rig_pictures", 8), ("rig_scene", 24)],
+)
+def test_shipped_files(name, steps):
     config = load_as(CaptureConfig, ROOT / "configs" / f"{name}.yaml")
     plan = command.build_plan(config)
-    assert len(plan.steps) == {"rig_virtual": 5, "rig_hadamard": 1032, "rig_pictures": 8}[name]
+    assert len(plan.steps) == steps
 
 
 PLUG_IN = recipe("a device")

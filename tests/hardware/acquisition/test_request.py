@@ -20,6 +20,8 @@ ZONES = {"betas": (25.0,), "width": 1.4}
         (PlanRequest("psf_stack", **ZONES, distances=(16.5,), phase=1.0), 1, {10.0}),
         (PlanRequest("hadamard", cells=(4, 8), dark_frames=2), 66, {None}),
         (PlanRequest("pictures", cells=(2, 3), frames=3, dark_frames=1), 7, {None}),
+        (PlanRequest("scene", frames=3, dark_frames=1), 4, {None}),
+        (PlanRequest("scene", exposures=(0.1, 1.0), frames=3, dark_frames=2), 10, {None}),
     ],
     ids=lambda given: getattr(given, "kind", ""),
 )
@@ -40,6 +42,8 @@ def test_steps(request_, kinds, positions):
         ({"kind": "pictures"}, "cells", "needs it"),
         ({"kind": "method_a", **ZONES, "distances": (5.0, 5.0)}, "distances", "stands twice"),
         ({"kind": "hadamard", "cells": (3, 5)}, "cells", "power of two"),
+        ({"kind": "scene", "exposures": (0.1, 0.1)}, "frames", "noise of each; give 2 or more"),
+        ({"kind": "scene", "betas": (25.0, 21.0)}, "betas", "has one β; give one"),
     ],
 )
 def test_what_does_not_fit(given, field, message):

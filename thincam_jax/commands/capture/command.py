@@ -1,7 +1,8 @@
 """The command `thincam capture`, and the devices of the files that it takes."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -198,7 +199,7 @@ def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
     from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.hardware.acquisition.rig import open_rig
 
-    pitch, virtual, pictures = config.display.pitch, None, picture_levels(config)
+    pitch, virtual, pictures = config.display.pitch or 0.0, None, picture_levels(config)
     if config.rig == "virtual":
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
@@ -206,17 +207,16 @@ def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
             rig = stack.enter_context(open_rig(config.drivers, pitch, virtual, pictures))
         except (ValueError, TypeError) as error:
             raise ConfigError(f"options: {error}") from None
-        _shown(plan.patterns[0], rig.display.shape, pitch, pictures)
+        _shown(rig.render, plan.patterns[0])
         yield rig
 
 
-def _shown(pattern: "Pattern", shape: tuple[int, int], pitch: float, pictures: Any) -> Any:
+def _shown(render: Callable[["Pattern"], Any], pattern: "Pattern") -> Any:
     """Levels (y, x) on a display. **Errors**: ConfigError for a pattern that it cannot show."""
     from thincam_jax.commands.config_file import ConfigError
-    from thincam_jax.hardware.displays.patterns import pattern_levels
 
     try:
-        return pattern_levels(pattern, shape, pitch, pictures)
+        return render(pattern)
     except ValueError as error:
         key = "width" if pattern.kind == "fza" else "cells"
         raise ConfigError(f"plan.{key}: {error}") from None
@@ -244,14 +244,8 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
             virtual.electrons,
             display.fill_factor,
         )
-    return VirtualRig(
-        seen,
-        virtual.build(Electronics),
-        display_shape=virtual.display,
-        response=virtual.response or 0.0,
-        fiducial=virtual.fiducial,
-        seed=config.seed,
-    )
+    given = {"electronics": virtual.build(Electronics), "display_shape": virtual.display}
+    return virtual.build(VirtualRig, optics=seen, seed=config.seed, **given)
 
 
 def _taken(store: Path, config: "CaptureConfig") -> "Taken":
@@ -263,33 +257,37 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     from thincam_jax._core.files import read_regular
     from thincam_jax.commands.capture.run import Taken, picture_levels
     from thincam_jax.hardware.acquisition.read import read_acquisition
-    from thincam_jax.hardware.virtual.rig import Electronics
+    from thincam_jax.hardware.displays.patterns import pattern_levels
+    from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Electronics
     from thincam_jax.measured.calibration import open_captures
-    from thincam_jax.studies.rig import CountingCamera
+    from thincam_jax.studies.rig import CountingCamera, RigFrames
 
-    found, hadamard, simulated = read_acquisition(store), None, None
+    found, hadamard, camera, variance = read_acquisition(store), None, None, None
     if config.plan.kind == "hadamard":
         hadamard = open_captures(store)
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
+    elif config.plan.kind == "scene":
+        frames, variance = found.scene()
     else:
         frames = found.captures()
     patterns, virtual = found.patterns[: len(frames)], config.virtual
     pictures = picture_levels(config)
     darks = sum(step.dark for step in found.plan.steps)
-    if config.rig == "virtual" and virtual is not None:
+    known = config.plan.kind != "scene" or variance is not None or config.plan.frames == 1
+    lit = np.ones(frames.shape[1:], bool)
+    if config.rig == "virtual" and virtual is not None and known:
+        lit[: FIDUCIAL_SHAPE[0], : FIDUCIAL_SHAPE[1]] = not virtual.fiducial
         electron, offset = virtual.build(Electronics).scale(found.settings[0])
         counts = electron * found.settings[0].exposure * virtual.electrons
-        simulated = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
+        camera = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
     display = (768, 1024) if virtual is None else virtual.display
+    render = partial(pattern_levels, shape=display, pitch=config.display.pitch, pictures=pictures)
     seconds = store / _SECONDS
     return Taken(
-        frames,
+        RigFrames(frames, camera, found.pixels, lit, darks, variance),
         [pattern.label for pattern in patterns],
-        [_shown(pattern, display, config.display.pitch, pictures) for pattern in patterns],
-        found.pixels,
-        json.loads(read_regular(seconds)) if seconds.is_file() else {},
-        simulated,
-        darks,
-        hadamard,
+        [_shown(render, pattern) for pattern in patterns if config.display.pitch],
         [one.exposure for one in found.settings],
+        json.loads(read_regular(seconds)) if seconds.is_file() else {},
+        hadamard,
     )

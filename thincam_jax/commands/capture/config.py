@@ -51,7 +51,7 @@ class DisplayConfig(
 ):
     """The modulator or monitor; `pitch`: of its pixels; `settle`: left out, it is measured."""
 
-    pitch: Length
+    pitch: Length | None = None
 
 
 class PlanConfig(section(PlanRequest)):
@@ -100,6 +100,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
 class CaptureConfig(ExperimentConfig):
     """What a rig captures, `rig: real`, or one that is simulated, `rig: virtual`.
 
+    - `display`: a scene needs none; someone covers the camera for dark frames.
     - `targets`: what stands at the object's distance of a virtual rig, one; or the pictures of a
       plan of kind pictures, on its cells.
     - `matrix`: with which such pictures are reconstructed: matrix.zarr of a calibration's run, or
@@ -109,7 +110,7 @@ class CaptureConfig(ExperimentConfig):
     kind: Literal["capture"]
     rig: Literal["virtual", "real"]
     camera: CameraConfig
-    display: DisplayConfig
+    display: DisplayConfig = DisplayConfig(driver="shutter")
     stage: DeviceConfig | None = None
     plan: PlanConfig
     acquisition: AcquisitionConfig = AcquisitionConfig()
@@ -126,7 +127,14 @@ class CaptureConfig(ExperimentConfig):
         kind = self.plan.kind
         if kind in ("method_a", "psf_stack") and self.stage is None:
             raise FieldError(f"a plan of kind {kind} moves a stage; give one", "stage")
-        if (kind in MONITOR) == (self.optics is not None):
+        simulated = self.rig == "virtual"
+        if self.display.pitch is None and (kind != "scene" or simulated):
+            raise FieldError(
+                f"a plan of kind {kind} is shown on pixels; give it", "display", "pitch"
+            )
+        if self.optics is not None and self.plan.width is None and kind not in MONITOR:
+            raise FieldError("optics need betas and width of the mask; give them", "plan", "width")
+        if (kind in MONITOR) == (self.optics is not None) and (kind != "scene" or simulated):
             verb = "takes no" if kind in MONITOR else "needs"
             raise FieldError(f"a plan of kind {kind} {verb} optics", "optics")
         check_names(self, "methods", "targets")
@@ -140,7 +148,7 @@ class CaptureConfig(ExperimentConfig):
         elif self.methods or len(self.targets) > 1:
             key = "methods" if self.methods else "targets"
             raise FieldError(f"a plan of kind {kind} has one picture and 'reconstruction'", key)
-        if self.rig == "virtual":
+        if simulated:
             self._check_virtual()
         return self
 

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,13 @@ from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
-from thincam_jax.measured import calibration
+from thincam_jax.measured import calibration, write_image
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
 from thincam_jax.studies.pictures import beside
 from thincam_jax.studies.rig import (
-    CountingCamera,
     FrameAgreement,
     MatrixAgreement,
-    Pixels,
     RigFrames,
     calibrated,
     compare_frames,
@@ -47,28 +45,23 @@ _MATRIX = (
     "read_matrix from thincam_jax.measured.calibration. For many captures, its reduced form is in "
     "reduced.npz, read by `ReducedMatrix.load`."
 )
-_FIDUCIAL = (12, 8)  # pixels of a fiducial, which see no light
 
 
 @dataclass(frozen=True)
 class Taken:
     """What was captured.
 
-    - `frames`: (capture, y, x) counts without the mean dark frame; of a Hadamard plan some only.
+    - `seen`: of a Hadamard plan some frames only; its camera is that of a virtual rig.
     - `labels`: what was shown for each. `seconds`: of the steps of the acquisition, by name.
-    - `simulated`: of a virtual rig. `dark_frames`: whose mean was subtracted.
-    - `pixels`: the part of the sensor that was read, rows and columns. `exposures`: s.
+    - `exposures`: s.
     """
 
-    frames: np.ndarray
+    seen: RigFrames
     labels: list[str]
     shown: list[np.ndarray]
-    pixels: Pixels
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    simulated: CountingCamera | None = None
-    dark_frames: int = 0
+    exposures: list[float]
+    seconds: Mapping[str, float]
     hadamard: calibration.HadamardCaptures | None = None
-    exposures: list[float] = field(default_factory=list)
 
 
 def run_captures(
@@ -86,7 +79,7 @@ class _CaptureRun(Run):
 
     def __init__(self, config: CaptureConfig, taken: Taken, folder: RunFolder):
         super().__init__(config, folder)
-        self.taken, self.lit = taken, _lit(config, taken.frames.shape[1:])
+        self.taken = taken
         self.agreement: FrameAgreement | MatrixAgreement | None = None
         self.table: Table | None = None  # of pictures
         self.metrics |= {
@@ -101,7 +94,7 @@ class _CaptureRun(Run):
             self.add("system matrix", self.recover)
         elif config.plan.kind == "pictures":
             self.add("images", self.look)
-        elif config.plan.kind != "psf_stack":
+        elif config.plan.kind != "psf_stack" and config.optics is not None:
             self.add("image", self.reconstruct)
         self.add("report", self.report)
 
@@ -111,24 +104,28 @@ class _CaptureRun(Run):
         self.complete(page(self.config, self.taken, self.agreement, self.table))
 
     def show(self) -> None:
-        taken, config, folder = self.taken, self.config, self.folder
-        frames = plot.draw_frames(taken.frames, taken.labels, config.camera.pitch, self.lit)
+        taken, config, folder, seen = self.taken, self.config, self.folder, self.taken.seen
+        frames = plot.draw_frames(seen.frames, taken.labels, config.camera.pitch, seen.lit)
         folder.save_figure("frames", frames)
-        shown = plot.draw_patterns(taken.shown, taken.labels, config.display.pitch)
-        folder.save_figure("shown", shown)
+        if taken.shown:
+            shown = plot.draw_patterns(taken.shown, taken.labels, config.display.pitch)
+            folder.save_figure("shown", shown)
+        if config.plan.kind == "scene":
+            write_image(folder.path / "scene.tif", seen.frames)
+        if seen.variance is not None:
+            write_image(folder.path / "variance.tif", seen.variance[None])
         if taken.seconds:
             folder.save_figure("seconds", plot.draw_seconds(taken.seconds))
 
     def reconstruct(self) -> None:
-        taken, config = self.taken, self.config
-        study = build_study(config, (taken.frames.shape[1], taken.frames.shape[2]))
+        seen, config = self.taken.seen, self.config
+        study = build_study(config, (seen.frames.shape[1], seen.frames.shape[2]))
         solve = frame_solver(study, study.config.object.width)
-        captured = solve(taken.frames)
+        captured = solve(seen.frames)
         images, scores = {"captured": captured}, {}
-        if taken.simulated is not None and config.virtual is not None:
+        if seen.camera is not None and config.virtual is not None:
             whole = build_study(config, config.virtual.sensor)
-            seen = taken.frames, taken.simulated, taken.pixels, self.lit, taken.dark_frames
-            found = compare_frames(whole, RigFrames(*seen), solve, captured, config.seed)
+            found = compare_frames(whole, seen, solve, captured, config.seed)
             images, scores, self.agreement = found.images, found.psnr_db, found.agreement
             self.metrics["psnr_db"] = scores
         self.folder.save_figure("images", plot.draw_images(images, scores))
@@ -145,7 +142,7 @@ class _CaptureRun(Run):
             known = calibrated(Path(config.matrix or ""), self.folder.path)
             solvers = {method.name: build_solver_of(method) for method in config.methods}
             shown = {name: levels / 255 for name, levels in picture_levels(config).items()}
-            found = reconstruct_pictures(shown, taken.frames, known, solvers)
+            found = reconstruct_pictures(shown, taken.seen.frames, known, solvers)
         except ValueError as error:
             raise ConfigError(f"{config.place_of('matrix')}matrix: {error}") from None
         drawn = draw_pictures(found.targets, found.captures, found.methods)
@@ -161,8 +158,8 @@ class _CaptureRun(Run):
         taken, exact = self.taken, None
         captures = taken.hadamard
         assert captures is not None
-        if taken.simulated is not None:
-            exact = screen_system(self.config), taken.simulated, taken.pixels
+        if taken.seen.camera is not None:
+            exact = screen_system(self.config), taken.seen.camera, taken.seen.pixels
         found = recover_to(self.folder.path, captures, exact)
         figure = draw_columns(self.config.camera.pitch, found.cells, found.columns)
         self.folder.save_figure("columns", figure)
@@ -174,14 +171,6 @@ class _CaptureRun(Run):
         }
 
 
-def _lit(config: CaptureConfig, shape: tuple[int, ...]) -> np.ndarray:
-    """Where frames show light."""
-    inside = np.ones(shape, bool)
-    if config.rig == "virtual" and config.virtual is not None and config.virtual.fiducial:
-        inside[: _FIDUCIAL[0], : _FIDUCIAL[1]] = False
-    return inside
-
-
 def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     """The cameras of a lensless plan, for frames of a shape, with the one method of its file.
 
@@ -190,7 +179,7 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     plan, optics, display = config.plan, config.optics, config.display
     assert optics is not None and plan.width is not None  # of lensless plans
     synthesis: Synthesis = "phase_pairs" if plan.kind == "method_b" else "fringe_scanning"
-    if plan.kind == "psf_stack":
+    if plan.kind in ("psf_stack", "scene"):
         synthesis = "separate"
     phases = PHASES.get(synthesis, (plan.phase,))
     distances = plan.distances if plan.kind == "method_a" else (optics.distance,)

@@ -37,6 +37,7 @@ from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
 from thincam_jax.hardware.base import CameraSettings, Identity
 from thincam_jax.hardware.displays.settle import LONGEST, settle_calibrate
+from thincam_jax.hardware.displays.shutter import Shutter
 from thincam_jax.hardware.errors import NotHomed, OutOfRange
 
 
@@ -218,7 +219,8 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 
 def _measured(run: Taker) -> tuple[CameraSettings, ...]:
     """Camera settings nearest to the plan's; exposure and settle time measured where asked for."""
-    asked, wanted, measured = run.plan.settings, run.procedure, run.procedure.settle is None
+    asked, wanted = run.plan.settings, run.procedure
+    measured = wanted.settle is None and not isinstance(run.rig.display, Shutter)
     if measured:
         run.procedure = replace(wanted, settle=LONGEST)
     lit = next((s for s in run.steps if not s.dark), run.steps[0])

@@ -4,7 +4,7 @@ A plan holds a table of patterns, one of camera settings, and the steps, which p
 SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with its own plan. The
 ready-made plans are those of the thesis: fringe scanning, method A (several mask-sensor distances),
 method B (pairs of phases of several β), a stack of PSFs by depth, Hadamard calibration, and
-pictures on the calibrated cells.
+pictures on the calibrated cells; and scenes, at one exposure or more.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ class Pattern:
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
     - "picture": `name` and SHA-256 `digest` of its levels on `rows` × `columns` cells.
-    - "black": no numbers. Other kinds are the renderer's own.
+    - "black", "white": no numbers. Other kinds are the renderer's own.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Pattern:
         return f"pattern {self.numbers['frame']}" if self.kind == "hadamard" else self.kind
 
 
-BLACK = Pattern("black")
+BLACK, WHITE = Pattern("black"), Pattern("white")
 
 
 @checked
@@ -78,7 +78,8 @@ class Plan:
 
     - `name`: its purpose, such as "method_b".
     - `facts`: numbers and texts stored with the captures. `stage_zero` is the distance, mm, at the
-      stage's position 0. With `series`, as in `hadamard`, `open_captures` reads the store.
+      stage's position 0. With `series`, as in `hadamard`, `open_captures` reads the store. With
+      `bracket`, frames of all but the shortest exposure may be saturated.
 
     **Errors**: ValueError for no steps, numbers that point outside of the tables, and what JSON
     cannot hold.
@@ -276,6 +277,32 @@ def pictures(
         named = {"name": name, "digest": picture_digest(levels)}
         shots += [(Pattern("picture", {**named, **numbers}), None)] * frames
     return _plan("pictures", shots, settings, dark_frames)
+
+
+def scene(
+    mask: Pattern,
+    settings: CameraSettings,
+    *,
+    exposures: Sequence[float] = (),
+    frames: int = 1,
+    dark_frames: int = 0,
+) -> Plan:
+    """Frames of what stands before the camera, which `Acquisition.merged` makes one image of.
+
+    - `mask`: shown meanwhile, such as a `zone_plate`.
+    - `exposures`: s, in place of the settings' one.
+    - `frames`, `dark_frames`: of each exposure; all dark ones come last.
+    """
+    every = tuple(dataclasses.replace(settings, exposure=float(one)) for one in exposures)
+    every = every or (settings,)
+    steps = [
+        Step(int(dark), None, number, dark)
+        for dark, count in ((False, frames), (True, dark_frames))
+        for number in range(len(every))
+        for _ in range(count)
+    ]
+    facts = {"bracket": len(every) > 1}
+    return Plan("scene", (mask, BLACK), every, tuple(steps), facts)
 
 
 def picture_digest(levels: np.ndarray) -> str:

@@ -14,6 +14,7 @@ from thincam_jax.hardware.acquisition.journal import frame_records, read_journal
 from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
 from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge_exposures
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,35 @@ class Acquisition:
             if offset is not None:
                 found[place] -= offset
         return found
+
+    def merged(self) -> MergedExposures:
+        """One linear image, counts per second, of a scene's frames; see `merge_exposures`."""
+
+        def frames(settings: int, dark: bool) -> np.ndarray:
+            steps = enumerate(self.plan.steps)
+            numbers = [n for n, s in steps if (s.settings, s.dark) == (settings, dark)]
+            return np.array([self.frame(number) for number in numbers])
+
+        return merge_exposures(
+            [
+                ExposedFrames(one.exposure, frames(number, False), frames(number, True))
+                for number, one in enumerate(self.settings)
+            ],
+            2**self.bits - 1,
+        )
+
+    def scene(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """One frame (1, y, x) of a scene, and its variance (y, x), in counts of the first exposure.
+
+        None for the variance, and the mean of the frames, where one exposure has no two frames and
+        two dark ones to tell it by.
+        """
+        darks = len(self.plan.steps) - len(self.lit)
+        if min(len(self.lit), darks) < 2 * len(self.settings):
+            return self.captures().mean(axis=0, keepdims=True), None
+        exposure, found = self.settings[0].exposure, self.merged()
+        frame = (exposure * found.rate)[None].astype(np.float32)
+        return frame, exposure**2 * found.variance
 
 
 def read_acquisition(path: str | Path) -> Acquisition:

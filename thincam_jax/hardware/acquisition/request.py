@@ -12,7 +12,9 @@ from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.lensless.masks.fza import PROFILES, Profile
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, HadamardSeries, Order
 
-PlanKind = Literal["fringe_scan", "method_a", "method_b", "psf_stack", "hadamard", "pictures"]
+PlanKind = Literal[
+    "fringe_scan", "method_a", "method_b", "psf_stack", "hadamard", "pictures", "scene"
+]
 MONITOR = "hadamard", "pictures"  # plans of a monitor's cells
 # What each kind needs, and what it may have beside the dark frames.
 _ZONES = ("betas", "width")
@@ -23,6 +25,7 @@ _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "psf_stack": ((*_ZONES, "distances"), ("profile", "phase")),
     "hadamard": (("cells",), ("order", "display")),
     "pictures": (("cells",), ("frames",)),
+    "scene": ((), (*_ZONES, "profile", "phase", "frames", "exposures")),
 }
 _MM = quantity("mm", positive=True, many=True)
 _CELLS = whole(1, 65536, optional=True, many=True)
@@ -38,8 +41,9 @@ class PlanRequest:
       what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
     - `cells`: rows and columns of cells on a monitor.
     - `order`, `display`: of the Hadamard patterns.
-    - `frames`: of each picture, whose mean counts.
-    - `dark_frames`: in all; they are spread over the plan.
+    - `frames`: of each picture, whose mean counts; of each exposure of a scene.
+    - `exposures`: of a scene, in place of the camera's; several are merged to one linear image.
+    - `dark_frames`: in all; they are spread over the plan. Of a scene, for each exposure.
 
     **Errors**: FieldError for what the kind lacks or does not take.
     """
@@ -54,6 +58,7 @@ class PlanRequest:
     order: Annotated[Order, choice(get_args(Order))] = "sequency"
     display: Annotated[Display, choice(get_args(Display))] = "complementary"
     frames: Annotated[int, whole(1, 1000)] = 1
+    exposures: Annotated[tuple[float, ...], quantity("s", positive=True, many=True)] = ()
     dark_frames: Annotated[int, DARK_FRAMES] = 0
 
     def __post_init__(self):
@@ -69,9 +74,13 @@ class PlanRequest:
             raise FieldError(f"a plan of kind {self.kind} takes {', '.join(allowed)}; drop it", key)
         if self.kind == "method_b" and len(self.betas) < 2:
             raise FieldError("method_b compares two β or more; give another", "betas")
-        if self.kind not in ("method_b", *MONITOR) and len(self.betas) != 1:
+        several = self.kind == "method_b" or self.kind in MONITOR
+        if not several and len(self.betas) != 1 and (self.betas or self.kind != "scene"):
             raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
-        for key in ("betas", "distances"):
+        for key in ("frames", "dark_frames"):
+            if len(self.exposures) > 1 and getattr(self, key) < 2:
+                raise FieldError("exposures are weighed by the noise of each; give 2 or more", key)
+        for key in ("betas", "distances", "exposures"):
             if len(set(getattr(self, key))) < len(getattr(self, key)):
                 raise FieldError("an entry stands twice; give each once", key)
         if self.kind == "hadamard":
@@ -103,9 +112,13 @@ class PlanRequest:
             return plans.hadamard(self.series, settings)
         if self.kind == "pictures":
             return plans.pictures(shown or {}, settings, frames=self.frames, **dark)
-        mask = plans.zone_plate(
-            self.betas[0], self.width or 0.0, phase=self.phase, profile=self.profile
-        )
+        mask = plans.WHITE
+        if self.betas:
+            form = {"phase": self.phase, "profile": self.profile}
+            mask = plans.zone_plate(self.betas[0], self.width or 0.0, **form)
+        if self.kind == "scene":
+            given = {"exposures": self.exposures, "frames": self.frames, **dark}
+            return plans.scene(mask, settings, **given)
         if self.kind == "method_b":
             return plans.method_b(mask, self.betas, settings, **dark)
         if self.kind == "fringe_scan":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from thincam_jax.hardware.acquisition.plan import Pattern
+from thincam_jax.hardware.acquisition.plan import BLACK, WHITE, Pattern
 from thincam_jax.hardware.base import Camera, Display, Identity, Stage
 from thincam_jax.hardware.registry import open_device
 
@@ -85,6 +85,7 @@ def open_rig(
     **Errors**: those of the drivers; ValueError for unknown options.
     """
     from thincam_jax.hardware.displays.patterns import pattern_levels
+    from thincam_jax.hardware.displays.shutter import Shutter
     from thincam_jax.hardware.virtual.devices import VirtualDevices
 
     with ExitStack() as stack:
@@ -96,6 +97,8 @@ def open_rig(
             openers = {role: partial(getattr(devices, role), *drivers[role]) for role in drivers}
 
         def render(pattern: Pattern) -> np.ndarray:
+            if isinstance(rig.display, Shutter):
+                pattern = BLACK if pattern == BLACK else WHITE
             return pattern_levels(pattern, rig.display.shape, pitch, pictures)
 
         rig = Rig(openers["camera"], openers["display"], render, openers.get("stage"))

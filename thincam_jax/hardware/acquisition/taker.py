@@ -180,7 +180,7 @@ class Taker:
         with self.clock("check"):
             # A copy, as drivers reuse their buffers.
             frame = replace(frame, pixels=np.array(frame.pixels))
-            saturated = self._check(frame, settings, probe)
+            saturated = self._check(frame, settings, probe or self._is_bracketed(step))
             self._refuse_repeated(step, frame.pixels)
         self._last = frame.number
         return frame, {"saturated": saturated, "position": position}
@@ -240,6 +240,12 @@ class Taker:
                 "see that the camera sees the display"
             )  # fmt: skip
         self._seen = step.pattern, pixels
+
+    def _is_bracketed(self, step: Step) -> bool:
+        """Whether a shorter exposure of the plan sees what this one saturates."""
+        exposures = [one.exposure for one in self.plan.settings]
+        bracket = bool(self.plan.facts.get("bracket"))
+        return bracket and exposures[step.settings] > min(exposures)
 
     def _check(self, frame: Frame, settings: CameraSettings, probe: bool) -> int:
         """Number of saturated pixels; HardwareError for a wrong frame."""

@@ -1,0 +1,51 @@
+"""A camera that is covered by hand for its dark frames."""
+
+import io
+
+import numpy as np
+import pytest
+from hardware.memory_rig import SETTINGS, MemoryCamera, World
+
+from thincam_jax.hardware import NotFound, Rig, open_device
+from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
+from thincam_jax.hardware.acquisition.plan import WHITE, scene
+from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.displays.patterns import pattern_levels
+
+
+@pytest.fixture
+def rig(monkeypatch):
+    """A rig without a display, and what its user was asked."""
+    world, asked = World(), []
+    world.shown = np.ones(world.shape, np.uint8)
+
+    def cover(text):
+        asked.append(text.partition(",")[0])
+        world.shown = np.zeros(world.shape, np.uint8) if "uncover" not in text else world.shown
+
+    monkeypatch.setattr("builtins.input", cover)
+    render = lambda pattern: pattern_levels(pattern, (1, 1), 0.0)  # noqa: E731
+    with Rig(
+        lambda: world.open(MemoryCamera), lambda: open_device("displays", "shutter"), render
+    ) as rig:
+        yield rig, asked
+
+
+def test_it_is_asked_for_once(rig, tmp_path):
+    plan = scene(WHITE, SETTINGS, exposures=(0.01, 0.05), frames=2, dark_frames=2)
+    procedure = Procedure(settle=None, exposure="auto")
+    acquire(plan, rig[0], tmp_path / "a.zarr", procedure=procedure)
+    assert rig[1] == ["cover the camera"]
+    taken = read_acquisition(tmp_path / "a.zarr")
+    assert taken.frame(3).max() == 4095  # the longer one may be full
+    frame, variance = taken.scene()
+    assert frame.shape == (1, *taken.sensor_shape) and np.isfinite(variance).all()
+    ratio = taken.settings[1].exposure / taken.settings[0].exposure
+    assert ratio == pytest.approx(5, rel=1e-2)
+
+
+def test_nobody_answers(monkeypatch):
+    shutter = open_device("displays", "shutter")
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    with pytest.raises(NotFound, match="cover the camera: nobody answers at a terminal; begin it"):
+        shutter.show(np.zeros((1, 1), np.uint8))

@@ -1,0 +1,41 @@
+"""Someone who covers the camera for its dark frames, in place of a display."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thincam_jax.hardware.base import Display, Identity
+from thincam_jax.hardware.errors import NotFound
+
+
+class Shutter(Display):
+    """For a camera before which nothing is shown: a black pattern asks to cover it, by hand.
+
+    A pattern is one level. The camera is taken for open at first.
+    """
+
+    shape = (1, 1)
+    identity = Identity("thincam_jax", "shutter by hand", "1")
+
+    @dataclass(frozen=True)
+    class Options:
+        """None."""
+
+    def __init__(self, options: Options):
+        self._is_open = True
+
+    def show(self, pattern: np.ndarray) -> None:
+        wanted = bool(pattern.any())
+        if wanted != self._is_open:
+            action = "uncover" if wanted else "cover"
+            try:
+                input(f"{action} the camera, then press Enter: ")
+            except EOFError as error:
+                raise NotFound(
+                    str(self.identity), f"{action} the camera", "nobody answers at a terminal",
+                    "begin it in one, or set dark_frames to 0"
+                ) from error  # fmt: skip
+        self._is_open = wanted
+
+    def close(self) -> None:
+        pass
