@@ -188,6 +188,7 @@ def test_too_few_steps_are_told():
     assert jnp.isnan(compiled_error(design((9.0,), (5.03,)), given))
 
 
+@pytest.mark.thorough
 def test_new_values_are_not_traced_again():
     """And a tenth of the light restores less."""
     one, pair = phase_pairs(1), (5.03,)

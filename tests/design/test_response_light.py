@@ -67,6 +67,7 @@ def test_variance_of_random_scenes(captured, kind):
     np.testing.assert_allclose(value, np.mean(variances), rtol=0.05 if kind == "quadrant" else 0.2)
 
 
+@pytest.mark.thorough
 def test_light_of_an_even_scene(captured):
     """Every pixel sees all of the mask: to 2 %, what the fringes add or take."""
     design, judged = small()

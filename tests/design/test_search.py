@@ -14,6 +14,7 @@ from thincam_jax.design import (
     SearchSettings,
     evaluate_grid,
     find_designs,
+    random_search,
 )
 
 SPACE = two_betas()
@@ -182,3 +183,23 @@ def test_95_per_cent_of_searches_find_the_best_of_a_fine_grid(optimised, frequen
     excess = np.array([r.found[0].objective / lowest - 1 for r in results])
     assert np.sum(excess < 1e-3) >= 0.95 * seeds
     assert max(r.evaluations for r in results) <= 1030
+
+
+def test_random_designs_cost_as_much_as_the_search():
+    """The best by the data, ranked by the exact ones, is that of NumPy at the same points."""
+    problem = DesignProblem(waves, SPACE, jnp.asarray(DEEPEST), jnp.asarray(DEEPEST + 1.0))
+    settings = SearchSettings(starts=6, samples=64)
+    search = find_designs(problem, settings, key=jax.random.key(0))
+    design, count = random_search(problem, search, settings, key=jax.random.key(1))
+    assert count == 64 + 3 * (search.evaluations - 64) > 200
+    points = jax.random.uniform(jax.random.key(1), (count, 2), SPACE.lower.dtype)
+    beta = np.asarray(jax.vmap(lambda point: SPACE.design(point).beta)(points))[:, [0, 2]]
+
+    def value(beta, data):
+        x = (beta - data) / 28.0
+        return 0.2 + np.sum(4 * x**2 + 0.4 * (1 - np.cos(2 * np.pi * 3.5 * x)), axis=-1)
+
+    best = beta[np.argsort(value(beta, DEEPEST))[:32]]
+    exact = value(best, DEEPEST + 1.0)
+    np.testing.assert_allclose(design.beta[jnp.asarray([0, 2])], best[np.argmin(exact)])
+    assert search.found[0].objective < min(exact)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import compilations, relative_l2
+from helpers import compilations, quick, relative_l2
 from thincam_jax.imaging.operators import Matrix, Separable
 from thincam_jax.learn.plug_and_play import noise_mistake, noise_ratio, remaining_deviation
 from thincam_jax.reconstruction.normal_equations import normal_equations
@@ -115,7 +115,7 @@ def test_with_a_linear_denoiser_it_ends_in_the_fixed_point_of_a_quadratic_proble
     assert min(gains) < 5e-3
 
 
-@pytest.mark.parametrize("kind", ["dense", "separable"])
+@pytest.mark.parametrize("kind", quick(["dense", "separable"], 1))
 def test_the_shipped_denoiser_beats_a_linear_estimate(kind):
     rng = np.random.default_rng(5)
     truth = np.zeros((32, 27))

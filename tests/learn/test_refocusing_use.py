@@ -41,6 +41,7 @@ def file(tmp_path_factory):
     return save(path, tiny.network(), tiny.lessons().manifest())
 
 
+@pytest.mark.thorough
 def test_a_network_comes_back_for_its_camera(file):
     (entry,) = network_description(file)["training"]["images"]["trained on"]
     assert entry["licence"] == "drawn" and re.fullmatch("[0-9a-f]{64}", entry["sha256"])

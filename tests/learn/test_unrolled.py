@@ -59,6 +59,7 @@ def test_trained_it_beats_as_many_untrained_iterations_on_scenes_it_has_not_seen
     assert again.losses == training.losses[:3]
 
 
+@pytest.mark.thorough
 def test_the_gradient_is_that_of_differences():
     problem, images = pairs(2, 40)
     model = UnrolledAdmm(problem, 3)

@@ -72,6 +72,7 @@ def test_a_capture_of_the_axis_says_that_it_has_no_response():
         tc.capture(camera(angular_response=1.0), scene, model=model)
 
 
+@pytest.mark.thorough
 def test_plans_decide_by_it():
     """At 3° cos⁴θ is 0.3 % off in the mean; a response of cos³⁰⁰θ is not left out."""
     scene = tc.Scene(tc.ImagePlane(np.ones((8, 12)), 250.0, 20.0), 500 * nm)

@@ -22,6 +22,7 @@ def closed():
     pyplot.close("all")
 
 
+@pytest.mark.thorough
 def test_a_history_shows_what_the_solver_noted():
     random = np.random.default_rng(0)
     recording = tc.Recording(

@@ -276,6 +276,7 @@ def test_the_nearest_image_by_least_squares(name):
 
 
 @pytest.mark.parametrize("background", quick([0.0, 0.5], 1))
+@pytest.mark.thorough
 def test_a_uniform_background_costs_no_iterations(background):
     """Of a random matrix with one eigenvalue 500 times the others, or none."""
     rng = np.random.default_rng(8)

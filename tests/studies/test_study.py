@@ -36,6 +36,7 @@ def test_scores_are_those_of_the_file(result, tmp_path):
     assert json.loads((folder.path / "metrics.json").read_text("utf-8")) == asdict(result.scores)
 
 
+@pytest.mark.thorough
 def test_some_targets_alone_have_the_same_scores(result):
     """The noise is that of the target's number."""
     study = tiny.study()

@@ -77,6 +77,7 @@ from thincam_jax.design.search import NonFiniteObjectiveError as NonFiniteObject
 from thincam_jax.design.search import Search as Search
 from thincam_jax.design.search import SearchSettings as SearchSettings
 from thincam_jax.design.search import find_designs as find_designs
+from thincam_jax.design.search import random_search as random_search
 from thincam_jax.design.sensitivity import FreeValue as FreeValue
 from thincam_jax.design.sensitivity import Sensitivity as Sensitivity
 from thincam_jax.design.sensitivity import sensitivity_around as sensitivity_around

@@ -149,6 +149,31 @@ def search_of(
     return Search(ranked(space, ended, separation), used, failed)
 
 
+_GRADIENT = 3  # evaluations that one with its gradient counts as
+
+
+def random_search(
+    problem: DesignProblem, search: Search, settings: SearchSettings, *, key: PRNGKeyArray
+) -> tuple[Design, int]:
+    """The best of random designs at the cost of a search, and how many there were.
+
+    An evaluation of a descent counts as three, for its gradient. The samples that are best by the
+    problem's data are ranked by its exact ones, where it has them.
+    """
+    space, batch = problem.space, max(settings.samples, settings.starts)
+    count = batch + _GRADIENT * max(search.evaluations - batch, 0)
+    every = jax.random.uniform(key, (count, space.size), space.lower.dtype)
+    # In parts as large as the search's samples, whose program they share.
+    whole = jnp.pad(every, ((0, -count % batch), (0, 0)), "edge").reshape(-1, batch, space.size)
+    parts = [evaluate(problem.objective, space, problem.data, part) for part in whole]
+    values = np.concatenate(parts)[:count]
+    best = every[np.argsort(values)[:_TRIED]]  # what is NaN comes last
+    if problem.exact is not None:
+        exact = evaluate(problem.objective, space, problem.exact, best, at_a_time=1)
+        best = best[np.argsort(np.asarray(exact))]
+    return space.design(best[0]), count
+
+
 # How many optima are improved on the exact objective, and how: from the best of so many even
 # samples within _NEAR, for its ripples are some hundredths of the cube wide, by a simplex that
 # begins with sides of _SIDE and ends with steps and relative gains below the next two; with so many

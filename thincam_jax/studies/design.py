@@ -39,6 +39,7 @@ from thincam_jax.design import (
     found_name,
     front_point,
     modulation_transfer,
+    random_search,
     rank_designs,
     rank_trained,
     score_design,
@@ -51,8 +52,11 @@ from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction import Wiener
+from thincam_jax.studies.held_out import HeldOut, further_photographs, hold_out
 from thincam_jax.studies.study import Method, Study, Synthesis
 from thincam_jax.studies.trials import simulate_trials
+
+RANDOM = "random search"
 
 if TYPE_CHECKING:
     from thincam_jax.studies.design_result import DesignResult
@@ -109,6 +113,8 @@ class DesignStudy:
     - `rivals`: the other designs given, by name.
     - `settings`: of the search; `grid`: points along each side of the landscape.
     - `seeds`: of the noise in the simulation; `best`: how many of the designs found it has.
+    - `photographs`: how many further ones the best design is compared on with the one to beat,
+      none of them trained on; 0 for none.
     - `training`, `fronts`: None for none.
     """
 
@@ -121,6 +127,7 @@ class DesignStudy:
     best: int = 3
     training: TrainingPlan | None = None
     fronts: FrontPlan | None = None
+    photographs: int = 12
 
     def __post_init__(self):
         if not isinstance(self.problem.objective, AbstractObjective):
@@ -202,6 +209,8 @@ class FoundDesigns:
     - `edge`: of the frequencies looked at, cycles/rad; `exponent`: of the prior.
     - `transfers`: of the reference and of the best design.
     - `training`: the trained designs; None without training.
+    - `random`: the best of `random_designs` random ones, at the cost of the search.
+    - `held_out`: the best design and the random one on photographs not trained on.
     """
 
     objective: AbstractObjective
@@ -214,6 +223,9 @@ class FoundDesigns:
     landscape: Landscape | None
     transfers: tuple[ModulationTransfer, ...] = ()
     training: TrainedDesigns | None = None
+    random: RankedDesign | None = None
+    random_designs: int = 0
+    held_out: HeldOut | None = None
 
 
 class DesignSearch:
@@ -232,6 +244,8 @@ class DesignSearch:
     descents: TrainingDescents
     trained: TrainedDesigns | None = None
     found: tuple[RankedDesign, ...]
+    random: RankedDesign
+    sampled: int
     result: FoundDesigns
 
     def __init__(self, study: DesignStudy):
@@ -248,7 +262,12 @@ class DesignSearch:
                 ),
                 Step("around the trained designs", self._finish_training),
             ]
-        self.ranking = [Step("found designs", self._rank), Step("landscape", self._surround)]
+        self.ranking = [
+            Step("found designs", self._rank),
+            Step("random designs", self._compare),
+            Step("landscape", self._surround),
+            Step("further photographs", self._hold_out),
+        ]
 
     @property
     def work(self) -> list[Step]:
@@ -279,6 +298,24 @@ class DesignSearch:
             else:
                 self.found = rank_trained(self.problem, self.trained)
 
+    def _compare(self) -> None:
+        """With the best of random designs at the same cost."""
+        key = jax.random.fold_in(self.study.key, 1)
+        with allow("float64"):
+            design, self.sampled = random_search(
+                self.problem, self.searched, self.study.settings, key=key
+            )
+            self.random = score_design(self.problem, design, RANDOM)
+
+    def _hold_out(self) -> None:
+        study, trained = self.study, self.study.training
+        used = () if trained is None else trained.images
+        names = further_photographs(used, study.photographs)
+        if len(names) > 1 and study.study.targets:
+            designs = {one.name: one.design for one in (self.found[0], self.random)}
+            held_out = hold_out(study.with_designs(designs), names)
+            self.result = replace(self.result, held_out=held_out)
+
     def _surround(self) -> None:
         problem, base, best = self.problem, self.problem.space.base, self.found[0].design
         with allow("float64"):
@@ -297,6 +334,8 @@ class DesignSearch:
                 landscape_if_any(problem, best, self.study.grid),
                 tuple(modulation_transfer(one, problem.exact) for one in (base, best)),
                 self.trained,
+                self.random,
+                self.sampled,
             )
 
 

@@ -136,6 +136,9 @@ def _summary(result: DesignResult) -> DesignScores:
         else summarise_fronts(
             result.fronts, design.problem.data.setup.noise, study.object_distance
         ),
+        None if found.random is None else _found(objective, found.reference, found.random),
+        found.random_designs,
+        found.held_out,
     )
 
 

@@ -8,9 +8,11 @@ from typing import Any
 from thincam_jax._core.table import Table, number
 from thincam_jax.design import FreeValue, Shot
 from thincam_jax.design.space import REPORTED
+from thincam_jax.studies.held_out import HeldOut
 from thincam_jax.studies.trials import Comparison, Spread
 
 _ALWAYS = ("beta", "distance")  # are reported of every shot
+_ONE_PER_CENT_DB = 10 * math.log10(1.01)  # the change of the error that tolerances are of
 
 
 @dataclass(frozen=True)
@@ -290,7 +292,10 @@ COSTS = {"thickness": "thickness, mm", "captures": "captures", "light": "electro
 
 @dataclass(frozen=True)
 class DesignScores:
-    """The figures of merit of a design study: designs, best first, their simulation and fronts."""
+    """The figures of merit of a design study: designs, best first, their simulation and fronts.
+
+    - `random`: the best of `random_designs` random ones, at the cost of the search.
+    """
 
     design: str
     seed: int
@@ -303,6 +308,9 @@ class DesignScores:
     validation: Validation
     warnings: list[str]
     pareto: FrontsScores | None = None
+    random: Candidate | None = None
+    random_designs: int = 0
+    held_out: HeldOut | None = None
 
     def levels(self) -> str:
         """What the gains are over, in a sentence."""
@@ -379,12 +387,35 @@ class DesignScores:
                     psnr = _worth(found.gain_db) if found.gain_db else "an exact image"
                     words = f"{name} resolves {steps} elements more, at {psnr}"
                     sentences.append(f"On {target}, {words}.")
+        sentences += self._beside_others()
         if not validation.one_object_grid:
             sentences.append(
                 "The designs' largest distances differ, and with them the object's pixels (in the "
                 "table below): their PSNR is not on one grid and compares to some tenths of a dB "
                 "only."
             )
+        return sentences
+
+    def _beside_others(self) -> list[str]:
+        """What random designs reach, and what is gained on further photographs."""
+        best, random, held_out = self.found[0].name, self.random, self.held_out
+        sentences = []
+        if random is not None:
+            sentences.append(
+                f"The best of {self.random_designs} random designs, which cost as much as the "
+                f"search, is predicted {random.predicted_gain:+.3g} {self.objective.unit}."
+            )
+        if held_out is not None:
+            gain, count = held_out.gains[best], len(held_out.photographs)
+            sentences.append(f"On {count} further photographs {best} gains {gain}")
+            if random is not None:
+                sentences[-1] += f", the random one {held_out.gains[random.name]}"
+            sentences[-1] += "."
+            if gain.low <= 0 or gain.mean < _ONE_PER_CENT_DB:
+                name = self.reference.name
+                sentences.append(
+                    f"That is within the tolerance of {name}: no new mask is worth making."
+                )
         return sentences
 
 

@@ -294,6 +294,17 @@ def test_sentences_of_the_report(whole):
     told = " ".join(design.findings())
     assert "Simulated, found 1 gains" in told
     assert "not on one grid" not in told
+    assert f"The best of {design.random_designs} random designs, which cost as much as" in told
+    gain = design.held_out.gains["found 1"]
+    assert f"On 3 further photographs found 1 gains {gain}, the random one " in told
+    small = replace(gain, mean=0.04, low=0.03)
+    gains = design.held_out.gains | {"found 1": small}
+    alike = replace(design, held_out=replace(design.held_out, gains=gains))
+    verdict = "within the tolerance of pairs: no new mask is worth making"
+    assert verdict in " ".join(alike.findings())
+    gains = gains | {"found 1": replace(gain, mean=0.5, low=0.1)}
+    better = replace(design, held_out=replace(design.held_out, gains=gains))
+    assert verdict not in " ".join(better.findings())
     methods = dict(design.validation.methods)
     gains = {"gain_elements": Spread(0.0, None, []), "gain_db": Spread(-1.06, None, [])}
     methods["found 1"] = {"chart": replace(methods["found 1"]["chart"], **gains)}

@@ -45,7 +45,7 @@ search:
 targets:
   - {name: chart, kind: usaf1951, pixels: 120}
   - {name: picture, kind: file, path: PICTURE}
-validate: {seeds: 2, best: 1}
+validate: {seeds: 2, best: 1, photographs: 3}
 """
 
 

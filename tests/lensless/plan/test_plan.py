@@ -161,6 +161,7 @@ def test_gradients_pass_through_a_planned_capture():
     assert relative_l2(planned[1], full) < 1e-2
 
 
+@pytest.mark.thorough
 def test_noise_is_added_to_a_planned_capture(key):
     few = scene(1, 1)
     plan = tc.plan(camera(), few, tolerance=1e-2)

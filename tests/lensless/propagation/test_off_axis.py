@@ -203,7 +203,9 @@ def test_batches_and_new_values_are_one_program():
         np.testing.assert_allclose(h, psf(np.asarray(at)), atol=1e-10)
 
 
-@pytest.mark.parametrize("at", [(0.0, 36.0), (25.0, 25.0)])
+@pytest.mark.parametrize(
+    "at", [pytest.param((0.0, 36.0), marks=pytest.mark.thorough), (25.0, 25.0)]
+)
 def test_single_precision(at):
     camera = camera_of(width=5.632, pitch=400 * um)
     exact, single = (

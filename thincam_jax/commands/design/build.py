@@ -57,6 +57,7 @@ def build_design(config: DesignConfig) -> DesignStudy:
         validation.best,
         _training(config),
         fronts,
+        validation.photographs,
     )
 
 
@@ -67,7 +68,8 @@ def build_designs(config: DesignConfig) -> Study:
 
     def assembled() -> Study:
         sensor, first = _sensor(config), given[config.reference.name].exposures[0]
-        mask, sensor = build.build_optics(_mask(config), sensor, first)
+        drawn = MaskConfig.model_construct(**dict(config.mask))
+        mask, sensor = build.build_optics(drawn, sensor, first)
         synthesis = config.reference.synthesis
         return Study(
             mask,
@@ -100,10 +102,6 @@ def _sensor(config: DesignConfig) -> SensorConfig:
     if config.noise.electrons is not None:
         sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
     return SensorConfig.model_construct(**sensor)
-
-
-def _mask(config: DesignConfig) -> MaskConfig:
-    return MaskConfig.model_construct(**dict(config.mask))
 
 
 def build_problem(config: DesignConfig, study: Study) -> DesignProblem:
@@ -221,7 +219,7 @@ def as_study_config(config: DesignConfig, methods: tuple[Method, ...]) -> StudyC
         model=config.model,
         pixel_integration=config.pixel_integration,
         sensor=_sensor(config),
-        mask=_mask(config),
+        mask=MaskConfig.model_construct(**dict(config.mask)),
         object=config.object,
         noise=config.noise.simulated(),
         methods=tuple(_method_config(config, method) for method in methods),

@@ -233,10 +233,11 @@ class SearchConfig(section(SearchSettings, only=LENGTH)):
 
 
 class ValidateConfig(Section):
-    """The full simulation: how many of the found designs, and noise from how many seeds."""
+    """The full simulation: seeds of the noise, designs found, and `photographs` beside targets."""
 
     seeds: Annotated[int, Field(ge=1, le=100)] = 5
     best: Annotated[int, Field(ge=1, le=10)] = 3
+    photographs: Annotated[int, Field(ge=0, le=16)] = 12
 
 
 class TrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))):
