@@ -31,6 +31,11 @@ from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.measured.calibration import open_matrix, read_matrix
 
 
+@pytest.fixture(autouse=True)
+def devices_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # where held devices are noted
+
+
 @pytest.fixture(scope="module")
 def method_b(tmp_path_factory):
     """The file and the store of a capture, taken once."""

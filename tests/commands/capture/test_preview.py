@@ -1,6 +1,7 @@
 """`thincam preview` on the virtual rig: frames, controls, a browser, and devices that are freed."""
 
 import json
+import os
 import shutil
 
 import pytest
@@ -8,6 +9,8 @@ import tifffile
 from commands.capture import tiny
 from commands.served import asked, assert_ctrl_c_frees, served
 from commands.test_cli import call, one_line
+
+from thincam_jax.hardware.holder import held
 
 pytest.importorskip("starlette")
 
@@ -79,6 +82,17 @@ def test_a_browser_shows_frame_after_frame(previewed):
 def test_ctrl_c_frees_the_port(previewed):
     child, port, *_ = previewed
     assert_ctrl_c_frees(child, port)
+
+
+def test_a_second_preview_of_a_camera_is_told_who_has_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    file = tiny.write(tmp_path)
+    for command in ("preview", "capture"):
+        with held("usb3_vision {serial: 7}"):
+            options = ("--set", "rig=real", "--set", "camera.options={serial: 7}")
+            result = call(command, file, *options)
+        (line,) = result.stderr.splitlines()
+        assert result.exit_code == 3 and f"(process {os.getpid()}) has held it since" in line
 
 
 def test_files_of_another_kind_and_devices_that_are_not_there(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 
 from thincam_jax.hardware.acquisition.plan import BLACK, WHITE, Pattern
 from thincam_jax.hardware.base import Camera, Display, Identity, Stage
+from thincam_jax.hardware.holder import held
 from thincam_jax.hardware.registry import open_device
 
 if TYPE_CHECKING:  # it brings JAX
@@ -82,7 +83,8 @@ def open_rig(
     - `virtual`: simulated optics, whose virtual devices are opened in place of real ones.
     - `pictures`: those of a plan of pictures, by name.
 
-    **Errors**: those of the drivers; ValueError for unknown options.
+    **Errors**: Busy for a device that another process holds; those of the drivers; ValueError for
+    unknown options.
     """
     from thincam_jax.hardware.displays.patterns import pattern_levels
     from thincam_jax.hardware.displays.shutter import Shutter
@@ -92,7 +94,12 @@ def open_rig(
         openers = {
             role: partial(open_device, f"{role}s", *given) for role, given in drivers.items()
         }
-        if virtual is not None:
+        if virtual is None:
+            for name, options in drivers.values():
+                if name != "shutter":
+                    chosen = ", ".join(f"{key}: {value}" for key, value in options.items())
+                    stack.enter_context(held(f"{name} {{{chosen}}}" if chosen else name))
+        else:
             devices = stack.enter_context(VirtualDevices(virtual))
             openers = {role: partial(getattr(devices, role), *drivers[role]) for role in drivers}
 
