@@ -1,4 +1,4 @@
-"""A scene at several exposures, by the commands, on the virtual rig and without a display."""
+"""Scenes and grey levels by the commands, on the virtual rig and without a display."""
 
 import json
 
@@ -12,6 +12,7 @@ from commands.test_cli import call, one_line
 from thincam_jax.commands.capture.command import build_plan
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
+from thincam_jax.hardware.displays.grey_levels import GreyLevels
 
 SCENE = yaml.safe_load(tiny.METHOD_B)
 SCENE["camera"]["exposure"] = "5 ms"
@@ -52,6 +53,22 @@ def test_a_real_scene_needs_neither_display_nor_optics(tmp_path):
     config = load_as(CaptureConfig, tiny.write(tmp_path, yaml.safe_dump(raw)))
     assert config.drivers["display"][0] == "shutter"
     assert len(build_plan(config).steps) == 3
+
+
+def test_the_table_of_grey_levels_of_a_linear_display(file):
+    """Level by level, and as the display's option."""
+    store, out = file.with_name("levels.zarr"), file.with_name("levels")
+    asked = "plan={kind: grey_levels, frames: 2, betas: [60 rad/mm^2], width: 1.44 mm}"
+    sets = ("--set", asked, "--set", "acquisition.exposure=auto")
+    for args in (("capture", file, "--out", store, *sets), ("run", store, "--out", out)):
+        result = call(*args)
+        assert result.exit_code == 0, result.output
+    levels = GreyLevels.read(out / "grey_levels.json")
+    assert np.abs(levels.table.astype(int) - np.arange(256)).max() <= 2
+    assert levels.provenance["frames"] == 2
+    table = f"display.options.grey_levels={out / 'grey_levels.json'}"
+    again = call("capture", file, "--out", file.with_name("b.zarr"), *sets, "--set", table)
+    assert "display.options.grey_levels: this plan measures it; drop it" in one_line(again)
 
 
 @pytest.mark.parametrize(

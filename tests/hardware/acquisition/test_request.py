@@ -21,6 +21,7 @@ ZONES = {"betas": (25.0,), "width": 1.4}
         (PlanRequest("hadamard", cells=(4, 8), dark_frames=2), 66, {None}),
         (PlanRequest("pictures", cells=(2, 3), frames=3, dark_frames=1), 7, {None}),
         (PlanRequest("scene", frames=3, dark_frames=1), 4, {None}),
+        (PlanRequest("grey_levels", frames=2), 36, {None}),
         (PlanRequest("scene", exposures=(0.1, 1.0), frames=3, dark_frames=2), 10, {None}),
     ],
     ids=lambda given: getattr(given, "kind", ""),

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hardware.displays.rig import Panel, PanelCamera
 
-from thincam_jax.hardware import Saturated
-from thincam_jax.hardware.displays.grey_levels import (
-    GreyLevels,
-    calibrate_grey_levels,
-    linear_levels,
-)
+from thincam_jax.hardware import CameraSettings, Rig
+from thincam_jax.hardware.acquisition.acquire import acquire
+from thincam_jax.hardware.acquisition.plan import grey_levels
+from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.displays.grey_levels import GreyLevels, linear_levels, measured_levels
+from thincam_jax.hardware.displays.patterns import pattern_levels
 
 SHAPE = 12, 20
 ALL = np.arange(256)
@@ -26,14 +26,16 @@ def s_curve_that_falls(levels):
 
 
 @pytest.mark.parametrize("panel", [gamma, s_curve_that_falls])
-def test_a_calibrated_display_is_linear(panel):
+def test_a_calibrated_display_is_linear(panel, tmp_path):
     display = Panel(SHAPE)
     camera = PanelCamera(display, panel)
-    levels = calibrate_grey_levels(display, camera, settle=0.0, frames=2)
-    assert levels.provenance["camera"] == str(camera.identity)
+    plan = grey_levels(CameraSettings(exposure=1e-3), frames=2)
+    render = lambda pattern: pattern_levels(pattern, SHAPE, 0.0)  # noqa: E731
+    with Rig(lambda: camera, lambda: display, render) as rig:
+        acquire(plan, rig, tmp_path / "a.zarr")
+    levels = measured_levels(read_acquisition(tmp_path / "a.zarr"))
+    assert levels.provenance["camera"]["model"] == "camera" and levels.provenance["frames"] == 2
     display.grey_levels = levels
-    with pytest.raises(ValueError, match="applies a table already"):
-        calibrate_grey_levels(display, camera, settle=0.0)
     seen = []
     for value in ALL:
         display.show(np.full(SHAPE, value, np.uint8))
@@ -82,10 +84,3 @@ def test_a_file_holds_the_table_and_its_origin(tmp_path):
 def test_measurements_that_give_no_table(levels, transmission, message):
     with pytest.raises(ValueError, match=message):
         linear_levels(np.array(levels), np.array(transmission))
-
-
-def test_saturated_frames_are_refused():
-    display = Panel(SHAPE)
-    camera = PanelCamera(display, lambda levels: 20.0 * levels)
-    with pytest.raises(Saturated, match="at level 210"):
-        calibrate_grey_levels(display, camera, settle=0.0)

@@ -236,14 +236,9 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
         seen = MonitorOptics(screen_system(config), virtual.electrons)
     else:
         plane = build_study(config, virtual.sensor).targets[0].plane
-        seen = ModulatorOptics(
-            Scene(plane, optics.wavelength),
-            Sensor(virtual.sensor, config.camera.pitch),
-            display.pitch,
-            optics.distance,
-            virtual.electrons,
-            display.fill_factor,
-        )
+        scene, sensor = Scene(plane, optics.wavelength), Sensor(virtual.sensor, config.camera.pitch)
+        light = optics.distance, virtual.electrons, display.fill_factor
+        seen = ModulatorOptics(scene, sensor, display.pitch, *light)
     given = {"electronics": virtual.build(Electronics), "display_shape": virtual.display}
     return virtual.build(VirtualRig, optics=seen, seed=config.seed, **given)
 
@@ -257,23 +252,26 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     from thincam_jax._core.files import read_regular
     from thincam_jax.commands.capture.run import Taken, picture_levels
     from thincam_jax.hardware.acquisition.read import read_acquisition
+    from thincam_jax.hardware.displays.grey_levels import measured_levels
     from thincam_jax.hardware.displays.patterns import pattern_levels
     from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Electronics
     from thincam_jax.measured.calibration import open_captures
     from thincam_jax.studies.rig import CountingCamera, RigFrames
 
-    found, hadamard, camera, variance = read_acquisition(store), None, None, None
-    if config.plan.kind == "hadamard":
-        hadamard = open_captures(store)
+    found, kind, camera, variance = read_acquisition(store), config.plan.kind, None, None
+    series = {
+        "hadamard": lambda: open_captures(store),
+        "grey_levels": lambda: measured_levels(found),
+    }
+    if kind in series:
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
-    elif config.plan.kind == "scene":
+    elif kind == "scene":
         frames, variance = found.scene()
     else:
         frames = found.captures()
     patterns, virtual = found.patterns[: len(frames)], config.virtual
-    pictures = picture_levels(config)
     darks = sum(step.dark for step in found.plan.steps)
-    known = config.plan.kind != "scene" or variance is not None or config.plan.frames == 1
+    known = kind != "scene" or variance is not None or config.plan.frames == 1
     lit = np.ones(frames.shape[1:], bool)
     if config.rig == "virtual" and virtual is not None and known:
         lit[: FIDUCIAL_SHAPE[0], : FIDUCIAL_SHAPE[1]] = not virtual.fiducial
@@ -281,7 +279,8 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         counts = electron * found.settings[0].exposure * virtual.electrons
         camera = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
     display = (768, 1024) if virtual is None else virtual.display
-    render = partial(pattern_levels, shape=display, pitch=config.display.pitch, pictures=pictures)
+    given = {"shape": display, "pitch": config.display.pitch, "pictures": picture_levels(config)}
+    render = partial(pattern_levels, **given)
     seconds = store / _SECONDS
     return Taken(
         RigFrames(frames, camera, found.pixels, lit, darks, variance),
@@ -289,5 +288,5 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         [_shown(render, pattern) for pattern in patterns if config.display.pitch],
         [one.exposure for one in found.settings],
         json.loads(read_regular(seconds)) if seconds.is_file() else {},
-        hadamard,
+        series[kind]() if kind in series else None,
     )

@@ -20,7 +20,7 @@ from thincam_jax.commands.sections import (
     VariationConfig,
     check_names,
 )
-from thincam_jax.hardware.acquisition.request import MONITOR, PlanRequest
+from thincam_jax.hardware.acquisition.request import ANYTHING, MONITOR, PlanRequest
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
@@ -134,9 +134,11 @@ class CaptureConfig(ExperimentConfig):
             )
         if self.optics is not None and self.plan.width is None and kind not in MONITOR:
             raise FieldError("optics need betas and width of the mask; give them", "plan", "width")
-        if (kind in MONITOR) == (self.optics is not None) and (kind != "scene" or simulated):
+        if (kind in MONITOR) == (self.optics is not None) and (kind not in ANYTHING or simulated):
             verb = "takes no" if kind in MONITOR else "needs"
             raise FieldError(f"a plan of kind {kind} {verb} optics", "optics")
+        if kind == "grey_levels" and self.display.options.get("grey_levels"):
+            raise FieldError("this plan measures it; drop it", "display", "options", "grey_levels")
         check_names(self, "methods", "targets")
         if (kind == "pictures") != (self.matrix is not None):
             verb = "needs it" if kind == "pictures" else "takes none; drop it"

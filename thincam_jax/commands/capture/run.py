@@ -21,7 +21,7 @@ from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
-from thincam_jax.measured import calibration, write_image
+from thincam_jax.measured import write_image
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
 from thincam_jax.studies.pictures import beside
@@ -53,7 +53,7 @@ class Taken:
 
     - `seen`: of a Hadamard plan some frames only; its camera is that of a virtual rig.
     - `labels`: what was shown for each. `seconds`: of the steps of the acquisition, by name.
-    - `exposures`: s.
+    - `exposures`: s. `calibration`: HadamardCaptures or GreyLevels, of such plans.
     """
 
     seen: RigFrames
@@ -61,7 +61,7 @@ class Taken:
     shown: list[np.ndarray]
     exposures: list[float]
     seconds: Mapping[str, float]
-    hadamard: calibration.HadamardCaptures | None = None
+    calibration: Any = None
 
 
 def run_captures(
@@ -92,6 +92,8 @@ class _CaptureRun(Run):
         self.add("captures", self.show)
         if config.plan.kind == "hadamard":
             self.add("system matrix", self.recover)
+        elif config.plan.kind == "grey_levels":
+            self.add("grey levels", self.linearise)
         elif config.plan.kind == "pictures":
             self.add("images", self.look)
         elif config.plan.kind != "psf_stack" and config.optics is not None:
@@ -153,11 +155,15 @@ class _CaptureRun(Run):
         self.metrics["methods"] = {name: asdict(one.scores) for name, one in found.methods.items()}
         self.table = beside(found.methods, published_figures(config.targets))
 
+    def linearise(self) -> None:
+        """The table of a display's grey levels, which its option of that name takes."""
+        self.taken.calibration.write(self.folder.path / "grey_levels.json")
+        self.metrics["grey_levels"] = dict(self.taken.calibration.provenance)
+
     def recover(self) -> None:
         """The matrix into a store, and what it is reduced to; compared where it is known."""
         taken, exact = self.taken, None
-        captures = taken.hadamard
-        assert captures is not None
+        captures = taken.calibration
         if taken.seen.camera is not None:
             exact = screen_system(self.config), taken.seen.camera, taken.seen.pixels
         found = recover_to(self.folder.path, captures, exact)

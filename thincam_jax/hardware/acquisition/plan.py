@@ -4,7 +4,7 @@ A plan holds a table of patterns, one of camera settings, and the steps, which p
 SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with its own plan. The
 ready-made plans are those of the thesis: fringe scanning, method A (several mask-sensor distances),
 method B (pairs of phases of several β), a stack of PSFs by depth, Hadamard calibration, and
-pictures on the calibrated cells; and scenes, at one exposure or more.
+pictures on the calibrated cells; and scenes, at one exposure or more, and levels of a display.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ class Pattern:
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
     - "picture": `name` and SHA-256 `digest` of its levels on `rows` × `columns` cells.
-    - "black", "white": no numbers. Other kinds are the renderer's own.
+    - "uniform": `level` of all pixels. "black": no numbers. Other kinds are the renderer's own.
     """
 
     kind: str
@@ -50,10 +50,12 @@ class Pattern:
             return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f}"
         if self.kind == "picture":
             return str(self.numbers["name"])
+        if self.kind == "uniform":
+            return f"level {self.numbers['level']}"
         return f"pattern {self.numbers['frame']}" if self.kind == "hadamard" else self.kind
 
 
-BLACK, WHITE = Pattern("black"), Pattern("white")
+BLACK, WHITE = Pattern("black"), Pattern("uniform", {"level": 255})
 
 
 @checked
@@ -277,6 +279,12 @@ def pictures(
         named = {"name": name, "digest": picture_digest(levels)}
         shots += [(Pattern("picture", {**named, **numbers}), None)] * frames
     return _plan("pictures", shots, settings, dark_frames)
+
+
+def grey_levels(settings: CameraSettings, *, frames: int = 1) -> Plan:
+    """Every fifteenth level of a display, the brightest first; `measured_levels` takes them."""
+    levels = [Pattern("uniform", {"level": level}) for level in range(255, -1, -15)]
+    return _plan("grey_levels", [(one, None) for one in levels for _ in range(frames)], settings, 0)
 
 
 def scene(

@@ -13,9 +13,17 @@ from thincam_jax.lensless.masks.fza import PROFILES, Profile
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, HadamardSeries, Order
 
 PlanKind = Literal[
-    "fringe_scan", "method_a", "method_b", "psf_stack", "hadamard", "pictures", "scene"
+    "fringe_scan",
+    "method_a",
+    "method_b",
+    "psf_stack",
+    "hadamard",
+    "pictures",
+    "scene",
+    "grey_levels",
 ]
 MONITOR = "hadamard", "pictures"  # plans of a monitor's cells
+ANYTHING = "scene", "grey_levels"  # plans before which anything may stand
 # What each kind needs, and what it may have beside the dark frames.
 _ZONES = ("betas", "width")
 _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -26,6 +34,7 @@ _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "hadamard": (("cells",), ("order", "display")),
     "pictures": (("cells",), ("frames",)),
     "scene": ((), (*_ZONES, "profile", "phase", "frames", "exposures")),
+    "grey_levels": ((), (*_ZONES, "frames")),
 }
 _MM = quantity("mm", positive=True, many=True)
 _CELLS = whole(1, 65536, optional=True, many=True)
@@ -41,7 +50,7 @@ class PlanRequest:
       what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
     - `cells`: rows and columns of cells on a monitor.
     - `order`, `display`: of the Hadamard patterns.
-    - `frames`: of each picture, whose mean counts; of each exposure of a scene.
+    - `frames`: of each picture or level, whose mean counts; of each exposure of a scene.
     - `exposures`: of a scene, in place of the camera's; several are merged to one linear image.
     - `dark_frames`: in all; they are spread over the plan. Of a scene, for each exposure.
 
@@ -75,7 +84,7 @@ class PlanRequest:
         if self.kind == "method_b" and len(self.betas) < 2:
             raise FieldError("method_b compares two β or more; give another", "betas")
         several = self.kind == "method_b" or self.kind in MONITOR
-        if not several and len(self.betas) != 1 and (self.betas or self.kind != "scene"):
+        if not several and len(self.betas) != 1 and (self.betas or self.kind not in ANYTHING):
             raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
         for key in ("frames", "dark_frames"):
             if len(self.exposures) > 1 and getattr(self, key) < 2:
@@ -112,6 +121,8 @@ class PlanRequest:
             return plans.hadamard(self.series, settings)
         if self.kind == "pictures":
             return plans.pictures(shown or {}, settings, frames=self.frames, **dark)
+        if self.kind == "grey_levels":
+            return plans.grey_levels(settings, frames=self.frames)
         mask = plans.WHITE
         if self.betas:
             form = {"phase": self.phase, "profile": self.profile}

@@ -6,25 +6,24 @@ With the transmission T(level) measured by a camera, the pattern value v is show
 """
 
 import json
-import time
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
 from thincam_jax._core.files import read_regular, write_whole
-from thincam_jax.hardware.base import Camera, Display
-from thincam_jax.hardware.errors import OutOfRange, Saturated
+from thincam_jax.hardware.base import Display
+from thincam_jax.hardware.errors import OutOfRange
+
+if TYPE_CHECKING:
+    from thincam_jax.hardware.acquisition.read import Acquisition
 
 LEVELS = 256
-_MOST_SATURATED = 1e-3  # of the pixels
 
 
 @dataclass(frozen=True)
@@ -119,47 +118,23 @@ def linear_levels(
     return GreyLevels(table.astype(np.uint8), {**(provenance or {}), **measured})
 
 
-def calibrate_grey_levels(
-    display: Display,
-    camera: Camera,
-    levels: tuple[int, ...] = (*range(0, LEVELS, 15),),
-    *,
-    settle: float,
-    frames: int = 4,
-    timeout: float = 1.0,
-) -> GreyLevels:
-    """Measure the transmission at uniform `levels` and return the table.
+def measured_levels(taken: "Acquisition") -> GreyLevels:
+    """Table from an acquisition of a plan of `grey_levels`, by a display without a table.
 
-    The display must not apply a table already. The camera is configured before and sees any part of
-    the display; the mean of each frame counts, averaged over `frames`. `settle` is the display's
-    settle time in s.
-
-    **Errors**: ValueError for a display that applies a table; Saturated; those of the devices.
+    The camera sees any part of the display; the mean of each frame counts.
     """
-    if getattr(display, "grey_levels", None) is not None:
-        raise ValueError("the display applies a table already; open it without one")
-    transmission, exposure = [], None
-    for level in levels:
-        display.show(np.full(display.shape, level, np.uint8))
-        time.sleep(settle)
-        means = []
-        for _ in range(frames):
-            frame = camera.trigger_and_grab(timeout)
-            full = np.mean(frame.pixels >= 2**frame.bit_depth - 1)
-            if full > _MOST_SATURATED:
-                cause = f"{full:.1%} of the pixels at level {level}"
-                remedy = "shorten the exposure"
-                raise Saturated(str(camera.identity), "calibrate grey levels", cause, remedy)
-            exposure = frame.exposure
-            means.append(frame.pixels.mean(dtype=float))
-        transmission.append(np.mean(means))
+    means: dict[int, list[float]] = {}
+    for number in taken.lit:
+        level = int(taken.plan.pattern(taken.plan.steps[number]).numbers["level"])
+        means.setdefault(level, []).append(float(taken.frame(number).mean(dtype=float)))
+    known, levels = taken.provenance, sorted(means)
     provenance = {
-        "display": str(display.identity),
-        "camera": str(camera.identity),
-        "exposure": exposure,
-        "settle": settle,
-        "frames": frames,
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "thincam_jax": version("thincam_jax"),
+        **{role: known["devices"][role] for role in ("display", "camera")},
+        "exposure": taken.settings[0].exposure,
+        "settle": known["procedure"]["settle"],
+        "frames": len(means[levels[0]]),
+        "time": known["begun"],
+        "thincam_jax": known["versions"]["thincam_jax"],
     }
-    return linear_levels(np.asarray(levels), np.asarray(transmission), provenance)
+    transmission = np.array([np.mean(means[level]) for level in levels])
+    return linear_levels(np.array(levels), transmission, provenance)

@@ -36,8 +36,8 @@ def pattern_levels(
         if levels is None or picture_digest(levels) != numbers["digest"]:
             raise ValueError(f"the picture {numbers['name']!r} is not the one of the plan")
         return on_cells(levels, shape)
-    if pattern.kind in ("black", "white"):
-        return np.full(shape, 255 * (pattern.kind == "white"), np.uint8)
+    if pattern.kind in ("black", "uniform"):
+        return np.full(shape, numbers.get("level", 0), np.uint8)
     if pattern.kind == "hadamard":
         cells, frame = (numbers.pop("rows"), numbers.pop("columns")), numbers.pop("frame")
         return on_cells(255 * HadamardSeries(cells, **numbers).frame(frame), shape)
