@@ -1,5 +1,7 @@
 """Screens found from a matrix or from ghosts: the errors claimed, other distances, what is open."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -139,6 +141,21 @@ def test_a_screen_from_its_matrix(optimised):
     found = matrix(fit.system(fit.plane)).matrix
     error = jnp.linalg.norm(found / 40 - matrix(true).matrix)
     assert error < 0.2 * jnp.linalg.norm(matrix(true).matrix)
+
+
+@pytest.mark.thorough
+def test_edges_of_holograms_that_cut_bands():
+    """Weights of cut bands are in the model; without, values are 50 standard errors off."""
+    bottom = wg.Rectangle((0.0, 22.5), (50.0, 45.0))  # the second ghost's light ends about it
+
+    def cut(glass):
+        given = camera(pixels=(7, 9), pitch=200.0 * um, glass=glass)
+        return replace(given, screen=replace(given.screen, bottom=bottom))
+
+    measured = matrix(wg.system_operator(cut(5.0), plane(), samples=4), noise=2e-4)
+    names = ("glass_thickness", "object_y")
+    fit = fit_screen(measured, cut(5.05), plane(), names, samples=4)
+    assert np.abs(deviations(fit, {"glass_thickness": 5.0, "object_y": 27.0})).max() < 4
 
 
 def reconstructed(operator, capture, deviation):

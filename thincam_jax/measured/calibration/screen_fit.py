@@ -188,13 +188,33 @@ def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
     return jnp.stack([x * slanted, y * slanted, cos * z - sin * across])
 
 
+class _Smear(eqx.Module):
+    """Of each order and pixel; it changes little with the screen, and is renewed for each blur.
+
+    - `offsets`: mm, of equal parts of the band from the Bragg wavelength's point.
+    - `band`: weight of the band, of which edges of holograms cut off a part; its mean is that of
+      `bragg`, the weight of the Bragg wavelength.
+    """
+
+    offsets: Array
+    band: Array
+    bragg: Array
+
+    def weight(self, bragg: Array) -> Array:
+        """Of the bands where those of the Bragg wavelengths have become `bragg`."""
+        grown = jnp.where(self.bragg > 0, bragg / jnp.where(self.bragg > 0, self.bragg, 1), 1)
+        return grown * self.band
+
+
+def _no_smear() -> _Smear:
+    return _Smear(jnp.zeros((1, 1, 1, 2)), jnp.ones((1, 1)), jnp.ones((1, 1)))
+
+
 class _Problem(eqx.Module):
     """Data of the least squares.
 
     `names`: of the parameters; `count`: number of orders. `unit`: of steps. `scale`: one over the
-    residual's unit. `full`: mean weight of a pixel. `smear`: offsets, mm, of equal parts of the
-    band from the Bragg wavelength's points. It changes little with the screen and is renewed from
-    the start of each blur.
+    residual's unit. `full`: mean weight of a pixel. `smear`: of each pixel's band.
     """
 
     start: _State
@@ -205,7 +225,7 @@ class _Problem(eqx.Module):
     scale: Array
     full: Array
     blur: Array
-    smear: Array
+    smear: "_Smear"
     names: tuple[str, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
@@ -317,8 +337,9 @@ def _of_matrix(measured: Matrix, start: _State, names: tuple[str, ...], orders: 
         raise MeasurementError(
             "no ray of the start reaches the object, or the matrix is 0; give another start"
         )
-    zero, one, none = jnp.zeros(()), jnp.ones(()), jnp.zeros((1, 1, 1, 2))
-    problem = _Problem(start, kept, pixels, None, one[None], one, full, zero, none, names, orders)
+    zero, one = jnp.zeros(()), jnp.ones(())
+    given = start, kept, pixels, None, one[None], one, full, zero, _no_smear()
+    problem = _Problem(*given, names, orders)
     # The gain is linear: the best one at the start, at the widest blur.
     problem = _blurred(problem, kept, _BLURS[0])
     model = _model(start, problem)
@@ -334,19 +355,21 @@ def _of_positions(
     if most >= orders:
         raise MeasurementError(f"a ghost of order {most}, but orders = {orders}; give more orders")
     seen = cast(measured, "float64")
-    one, none, scale = jnp.ones(()), jnp.zeros((1, 1, 1, 2)), 1 / seen.deviation
+    one, scale = jnp.ones(()), 1 / seen.deviation
     data = seen.points, seen.pixels, seen.orders
-    return _Problem(start, *data, one[None], scale, one, one, none, names, orders)
+    return _Problem(start, *data, one[None], scale, one, one, _no_smear(), names, orders)
 
 
-def _smear(problem: _Problem, samples: int | None) -> Array:
-    """Offsets of parts of the band from the Bragg wavelength, (order, pixel, sample, 2)."""
+def _smear(problem: _Problem, samples: int | None) -> _Smear:
     if samples is None:
-        return jnp.zeros((1, 1, 1, 2))
+        return _no_smear()
     camera, distance = problem.start.camera, problem.start.plane.distance
     band = trace_band(camera, problem.pixels, distance, problem.count, samples)
-    centre = trace(camera, problem.pixels, distance, problem.count).points[..., None, :2]
-    return jnp.where(band.weight[..., None, None] > 0, band.points - centre, 0)
+    rays = trace(camera, problem.pixels, distance, problem.count)
+    away = band.points - rays.points[..., None, :2]
+    mean = jnp.sum(rays.weight) / jnp.sum(band.weight)
+    offsets = jnp.where(band.weight[..., None, None] > 0, away, 0)
+    return _Smear(offsets, mean * band.weight, rays.weight)
 
 
 def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
@@ -393,12 +416,13 @@ def _model(state: _State, problem: _Problem):
     rays = trace(camera, problem.pixels, plane.distance, problem.count)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
-        centroid = rays.points[..., :2] + jnp.mean(problem.smear, axis=2)
+        centroid = rays.points[..., :2] + jnp.mean(problem.smear.offsets, axis=2)
         return centroid[problem.orders, place] - plane.centre
     size = seen_size(camera, plane)
-    points = rays.points[..., None, :2] + problem.smear
+    offsets = problem.smear.offsets
+    points = rays.points[..., None, :2] + offsets
     down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0))
-    weight = state.gain * rays.weight / problem.full / problem.smear.shape[2]
+    weight = state.gain * problem.smear.weight(rays.weight) / problem.full / offsets.shape[2]
     return jnp.einsum("op,opsy,opsx->pyx", weight, down, across)
 
 
