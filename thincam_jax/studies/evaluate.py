@@ -29,6 +29,7 @@ from thincam_jax.reconstruction import (
     Wiener,
     reconstruct,
 )
+from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.studies.simulate import Capture, stacked
 from thincam_jax.studies.study import Method, Study, Target
@@ -168,7 +169,10 @@ def _solver(
     if hasattr(solver, "synthesis"):
         solver = replace(solver, synthesis=method.synthesis_matrix)
     if isinstance(solver, Wiener):
-        return solver.prepare(cameras)
+        wiener = solver.prepare(cameras)
+        if study.noise is None:
+            return lambda captures, variances: wiener(captures, estimate_variance(captures))
+        return wiener
 
     def solved(captures: Array, variances: Array) -> Reconstruction:
         """On the crop model; without noise in the study it is estimated."""
