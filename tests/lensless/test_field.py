@@ -46,6 +46,7 @@ def point(row, column):
 
 # The middle of the field, its edge and its corner, and two between the points of its grid.
 @pytest.mark.parametrize("place", [(25, 33), (0, 33), (49, 65), (13, 57), (31, 5)])
+@pytest.mark.thorough
 def test_every_point_has_its_own_psf(fit, place):
     exact, whole = captured_alone(*place)
     error = np.linalg.norm(np.asarray(fit.operator(point(*place))) - exact)

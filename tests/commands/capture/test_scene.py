@@ -55,6 +55,7 @@ def test_a_real_scene_needs_neither_display_nor_optics(tmp_path):
     assert len(build_plan(config).steps) == 3
 
 
+@pytest.mark.thorough
 def test_the_table_of_grey_levels_of_a_linear_display(file):
     """Level by level, and as the display's option."""
     store, out = file.with_name("levels.zarr"), file.with_name("levels")
