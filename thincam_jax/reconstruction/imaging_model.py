@@ -96,8 +96,12 @@ class Cameras(Module):
     @property
     def pitch(self) -> Float[Array, "*plane"]:
         """Distance of the image's pixels on the object, mm: p·t/d of the largest d."""
-        furthest = max(self.cameras, key=lambda c: float(c.distance))
+        furthest = self._furthest
         return furthest.sensor.pitch * jnp.asarray(self.object_distance) / furthest.distance
+
+    @property
+    def _furthest(self) -> LenslessCamera:
+        return max(self.cameras, key=lambda c: float(c.distance))
 
     @property
     def wavelengths(self) -> Float[Array, " camera"]:
@@ -122,11 +126,11 @@ class Cameras(Module):
         return isinstance(self.model, PsfMethod) and self.model.field_tolerance is not None
 
     def light(self, field: tuple[int, int]) -> Float[Array, "m n"]:
-        """Of the points of a field, 1 on the axis; without a `field_tolerance` everywhere."""
+        """Of the points of a field, 1 on the axis; without a `field_tolerance` one 1 for all."""
         if not self.over_field:
-            return jnp.ones(field)
-        furthest = max(self.cameras, key=lambda c: float(c.distance))
-        return jnp.asarray(light_over_field(furthest.sensor, *tangents_of(furthest, field)))
+            return jnp.ones((1, 1))
+        sensor, tangents = self._furthest.sensor, tangents_of(self._furthest, field)
+        return jnp.asarray(light_over_field(sensor, *tangents))
 
     def field_operators(self, field: tuple[int, int]) -> tuple[LowRank, ...]:
         """The operator of each camera over its field, from the object as it lies on the sensor."""

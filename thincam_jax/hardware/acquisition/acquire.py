@@ -229,9 +229,8 @@ def _measured(run: Taker) -> tuple[CameraSettings, ...]:
         def level_at(exposure: float) -> float:
             settings = run.persist(lambda: run.set_near(replace(asked[0], exposure=exposure)))
             frame, _ = run.take(lit, settings, probe=True)
-            return float(np.quantile(frame.pixels, wanted.auto_exposure.quantile)) / full_scale(
-                frame
-            )
+            level = np.quantile(frame.pixels, wanted.auto_exposure.quantile)
+            return float(level) / full_scale(frame)
 
         start = asked[0].exposure
         ratio = find_exposure(level_at, start, wanted.auto_exposure, run.name("camera")) / start
