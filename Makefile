@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help run test test-all test-lowest lint bench docs clean
+.PHONY: help run test test-all test-lowest lint bench bench-gpu docs clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-14s %s\n", $$1, $$2 }'
@@ -43,6 +43,9 @@ lint: .venv/.installed-dev ## Check the style, the formatting and the types.
 
 bench: .venv/.installed-bench ## Measure speed and accuracy.
 	@$(BIN)/python -m pytest benchmarks --benchmark-columns=min,median,stddev,rounds $(ARGS)
+
+bench-gpu: .venv/.installed-bench ## Measure a GPU beside the processor; needs JAX's plugin for the GPU.
+	@JAX_PLATFORMS= $(BIN)/python -m pytest benchmarks/test_gpu.py --benchmark-columns=min,median,stddev,rounds $(ARGS)
 
 docs: .venv/.installed-docs ## Build the documentation into docs/_build; FAST=1 executes no script.
 	@$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build

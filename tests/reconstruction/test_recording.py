@@ -336,7 +336,7 @@ def test_operators_with_captures_of_any_shape():
             assert problem.image_shape == (*(batch or (1,)), 1, 4, 5)
             image = jax.device_put(RNG.uniform(size=problem.image_shape))
             outcome = Outcome(image, "converged", (), 1, 0.0)
-            result = recording.reconstruction(problem, outcome, "admm_tv")
+            result = recording.reconstruction(outcome, "admm_tv")
             np.testing.assert_array_equal(result.image, np.reshape(image, (*batch, 4, 5)))
             assert result.pitch is None
 

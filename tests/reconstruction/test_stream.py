@@ -58,3 +58,29 @@ def test_bad_input():
         tc.Stream(recording, tc.AdmmTV(1.0), steps=0)
     with pytest.raises(ValueError, match="tau = 'sure' is a rule for one capture; give a number"):
         tc.Stream(recording, tc.AdmmTV("sure"))
+
+
+@pytest.mark.parametrize(
+    ("synthesis", "model"),
+    [
+        (None, "separable"),
+        ([[1, -1], [1, 1]], "separable"),
+        pytest.param(None, tc.PsfMethod(field_tolerance=0.1), marks=pytest.mark.thorough),
+    ],
+    ids=["captures", "contrasts", "field"],
+)
+def test_frames_of_cameras(synthesis, model):
+    """Two phases, with computed PSFs: the upright image that the solver alone finds."""
+    masks = [tc.FresnelZoneAperture(60.0, phase, width=0.5) for phase in (0.0, np.pi)]
+    cameras = [tc.LenslessCamera(mask, tc.Sensor(SENSOR, 0.04), 5.0) for mask in masks]
+    light = {"wavelength": 500e-6, "object_distance": 250.0}
+    optics = tc.Cameras(cameras, field_shape=FIELD, model=model, **light)
+    plane = tc.ImagePlane(scenes.blocks(FIELD), distance=250.0, width=20.0)
+    captures = np.stack([tc.capture(c, tc.Scene(plane, 500e-6)) for c in cameras])
+    solver = tc.AdmmTV(1.0, iterations=400, tolerance=1e-9, synthesis=synthesis)
+    first = tc.Recording(captures, optics, noise_variance=1e-5)
+    stream = tc.Stream(first, solver, steps=10)
+    for _ in range(30):
+        stream, image = stream.next(1.5 * captures)
+    alone = tc.reconstruct(tc.Recording(1.5 * captures, optics, noise_variance=1e-5), solver)
+    assert relative_l2(image, alone.image) < 1e-3

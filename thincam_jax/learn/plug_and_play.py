@@ -179,7 +179,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         done, seconds = max(len(history) - 1, 0), time.perf_counter() - began
         whole_image = jnp.stack(images).reshape(problem.image_shape)
         outcome = Outcome(whole_image, status, tuple(history), done, seconds)
-        return recording.reconstruction(problem, outcome, self.name)
+        return recording.reconstruction(outcome, self.name)
 
 
 class _Run:

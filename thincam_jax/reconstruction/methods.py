@@ -230,7 +230,7 @@ class AbstractRegularised(AbstractIterativeSolver):
                 seconds = time.perf_counter() - began
                 image = end.image if unit is None else end.image / unit
                 outcome = Outcome(image, "interrupted", (), 0, seconds)
-                return recording.reconstruction(problem, outcome, self.name, float(problem.tau))
+                return recording.reconstruction(outcome, self.name, float(problem.tau))
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=given)
@@ -238,7 +238,7 @@ class AbstractRegularised(AbstractIterativeSolver):
             outcome = dataclasses.replace(outcome, image=outcome.image / unit)
         if rule:
             outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
-        result = recording.reconstruction(problem, outcome, self.name, float(problem.tau))
+        result = recording.reconstruction(outcome, self.name, float(problem.tau))
         return dataclasses.replace(result, reason=reason) if reason else result
 
 

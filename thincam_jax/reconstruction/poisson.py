@@ -187,7 +187,7 @@ class PoissonTV(AbstractIterativeSolver):
             iterations=self.iterations,
             tolerance=self.tolerance,
         )
-        return recording.reconstruction(problem, outcome, self.name, float(self.tau))
+        return recording.reconstruction(outcome, self.name, float(self.tau))
 
 
 def solve_poisson(

@@ -35,7 +35,13 @@ from thincam_jax.reconstruction.iterate import Outcome, Progress
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.problem import InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
-from thincam_jax.reconstruction.synthesis import Channel, separate, synthesis_matrix, with_channel
+from thincam_jax.reconstruction.synthesis import (
+    Channel,
+    channel_capture,
+    separate,
+    synthesis_matrix,
+    with_channel,
+)
 
 
 class Reconstruction(Module):
@@ -196,22 +202,13 @@ class Recording(Module):
         return _convolutions(channels, variances, pitch, self._field(), settings)
 
     def reconstruction(
-        self, problem: InverseProblem, outcome: Outcome, method: str, tau: float | None = None
+        self, outcome: Outcome, method: str, tau: float | None = None
     ) -> Reconstruction:
         """The image of an outcome, upright and with the axes of the captures, with its history."""
-        image, pitch = outcome.image, None
-        if isinstance(self.imaging_model, Cameras):
-            pitch = self.imaging_model.pitch
-        elif isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None:
-            image = centred_crop(
-                image, self.captures[0].shape[-2:]
-            )  # the part in front of the sensor
-        planes = image.shape[-3]
-        batch = image.shape[:-3] if self._has_channel() else image.shape[:-4]
-        image = image.reshape(*batch, *((planes,) if planes > 1 else ()), *image.shape[-2:])
+        model = self.imaging_model
         return Reconstruction(
-            self.oriented(image),
-            pitch,
+            self.shaped(outcome.image),
+            model.pitch if isinstance(model, Cameras) else None,
             method,
             ending=outcome.status,
             history=outcome.history,
@@ -220,11 +217,29 @@ class Recording(Module):
             tau=tau,
         )
 
+    def shaped(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "..."]:
+        """The image of a problem, upright and with the axes of the captures."""
+        if isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None:
+            image = centred_crop(
+                image, self.captures[0].shape[-2:]
+            )  # the part in front of the sensor
+        planes = image.shape[-3]
+        batch = image.shape[:-3] if self._has_channel() else image.shape[:-4]
+        image = image.reshape(*batch, *((planes,) if planes > 1 else ()), *image.shape[-2:])
+        return self.oriented(image)
+
     def oriented(self, image: Float[Array, "..."]):
         """The upright image of the scene: cameras turn it by 180°. It is its own inverse."""
         if not isinstance(self.imaging_model, Cameras):
             return image
         return jnp.asarray(image)[..., ::-1, ::-1]
+
+    def channel_captures(
+        self, rows: Sequence[Sequence[float]], ratios: Sequence[float]
+    ) -> tuple[Array, ...]:
+        """The captures that a problem of PSFs takes, by `synthesis_rows`."""
+        captures, _ = self._masked_captures()
+        return tuple(channel_capture(row, captures, ratios) for row in rows)
 
     def with_noise(self, variance: Numbers) -> "Recording":
         """This recording with another noise variance."""
@@ -342,16 +357,21 @@ class Recording(Module):
 
     def _channels(self, synthesis, captures, valid) -> tuple[np.ndarray, list[Channel]]:
         """The channels of a synthesis."""
+        model, (matrix, ratios) = self.imaging_model, self.synthesis_rows(synthesis)
+        if isinstance(model, Cameras):
+            kernels = model.kernels(self._field(), ratios)
+        else:
+            kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
+        return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
+
+    def synthesis_rows(self, synthesis) -> tuple[np.ndarray, list[float]]:
+        """The matrix (channel × capture) of a synthesis, and the enlargement of each capture."""
         model = self.imaging_model
         if isinstance(model, Cameras):
             ratios = distance_ratios(model.cameras)
-            matrix = synthesis_matrix(synthesis, model.cameras, ratios)
-            kernels = model.kernels(self._field(), ratios)
-        else:
-            _no_synthesis(synthesis, "measured PSFs")
-            matrix, ratios = separate(len(captures)), [1.0] * len(captures)
-            kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
-        return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
+            return synthesis_matrix(synthesis, model.cameras, ratios), ratios
+        _no_synthesis(synthesis, "measured PSFs")
+        return separate(len(self.captures)), [1.0] * len(self.captures)
 
 
 def _mask(valid: Any, shape: tuple[int, ...]) -> Bool[Array, "..."]:

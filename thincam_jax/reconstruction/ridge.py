@@ -160,7 +160,7 @@ class Ridge(AbstractSolver):
         )
         if prior is not None:
             outcome = replace(outcome, image=mean + prior.image(outcome.image))
-        return recording.reconstruction(problem, outcome, self.name)
+        return recording.reconstruction(outcome, self.name)
 
     def deviation(self, recording: Recording) -> Float[Array, "*plane y x"]:
         r"""The posterior standard deviation of each pixel, in the scene's unit.

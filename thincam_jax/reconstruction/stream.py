@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax.imaging.operators import Stacked
 from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod, State, admm_map
-from thincam_jax.reconstruction.iterate import CHUNK, Outcome
+from thincam_jax.reconstruction.iterate import CHUNK
 from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
@@ -58,6 +59,8 @@ class Stream(eqx.Module):
     method: AdmmMethod
     state: State
     steps: int = eqx.field(static=True)
+    rows: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    ratios: tuple[float, ...] = eqx.field(static=True)
 
     def __init__(self, recording: Recording, solver: AdmmTV, *, steps: int = 4):
         if isinstance(solver.tau, str):
@@ -65,6 +68,10 @@ class Stream(eqx.Module):
         self.recording, self.solver = recording, solver
         self.steps = checks.whole("steps", steps, 1)
         problem = _posed(recording, solver)
+        self.rows, self.ratios = (), ()
+        if not isinstance(recording.imaging_model, Stacked):
+            rows, ratios = recording.synthesis_rows(solver.synthesis)
+            self.rows, self.ratios = tuple(map(tuple, rows.tolist())), tuple(ratios)
         method: Any = admm_method(problem)
         running = method.start(jnp.zeros(problem.image_shape, problem.captures[0].dtype))
         for done in range(CHUNK, solver.iterations + CHUNK, CHUNK):
@@ -98,11 +105,13 @@ def _posed(recording: Recording, solver: AdmmTV) -> InverseProblem:
 
 @eqx.filter_jit
 def _next(stream: Stream, captures: tuple[Array, ...]):
-    first, method, state = stream.recording, stream.method, stream.state
-    problem = _posed(replace(first, captures=captures), stream.solver)
-    splitting = method.arguments.with_captures(problem.captures)
+    recording, state = replace(stream.recording, captures=captures), stream.state
+    if stream.rows:  # a problem's PSFs would be computed anew
+        captures = recording.channel_captures(stream.rows, stream.ratios)
+    else:
+        captures = _posed(recording, stream.solver).captures
+    splitting = stream.method.arguments.with_captures(captures)
     for _ in range(stream.steps):
         mapped = admm_map(state, splitting)
         state = jax.tree.map(lambda q, t: q + RELAXATION * (t - q), state, mapped)
-    outcome = Outcome(splitting.image(state), "stopped", (), stream.steps, 0.0)
-    return state, first.reconstruction(problem, outcome, stream.solver.name).image
+    return state, recording.shaped(splitting.image(state))

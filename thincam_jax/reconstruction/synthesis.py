@@ -146,10 +146,10 @@ class Channel:
         valid: Sequence[Any],
         ratios: Sequence[float],
     ):
-        used = [(float(w), k) for k, w in enumerate(row) if w]
+        used = _used(row)
         self.ratio = ratios[used[0][1]]
-        self.kernel, whole = _weighted_sum(used, kernels), _weighted_sum(used, captures)
-        self.capture = with_channel(register(whole, self.ratio), 2)
+        self.kernel = _weighted_sum(used, kernels)
+        self.capture = channel_capture(row, captures, ratios)
         self.valid = None
         if valid[0] is not None or self.ratio > 1:
             both = jnp.ones(captures[0].shape, bool)
@@ -159,6 +159,18 @@ class Channel:
             # the interpolation also overshoots.
             seen = register(both.astype(captures[0].dtype), self.ratio)
             self.valid = with_channel(jnp.abs(seen - 1) < 0.01, 2)
+
+
+def channel_capture(
+    row: Sequence[float] | np.ndarray, captures: Sequence[Array], ratios: Sequence[float]
+) -> Array:
+    """The sum of captures of a synthesis' row, enlarged to its scale, with a channel axis."""
+    used = _used(row)
+    return with_channel(register(_weighted_sum(used, captures), ratios[used[0][1]]), 2)
+
+
+def _used(row) -> list[tuple[float, int]]:
+    return [(float(w), k) for k, w in enumerate(row) if w]
 
 
 def _weighted_sum(used: Sequence[tuple[float, int]], parts: Sequence[Array]) -> Array:
