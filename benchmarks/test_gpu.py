@@ -166,7 +166,7 @@ def test_gpu(benchmark, task, device):
     with jax.enable_x64(False), jax.default_device(device):
         call = task()
         result = np.asarray(jax.block_until_ready(call()))
-        rounds = 3 if device == CPU else 20
+        rounds = 2 if device == CPU else 20
         run = lambda: jax.block_until_ready(call())  # noqa: E731
         benchmark.pedantic(run, rounds=rounds, warmup_rounds=1, iterations=1)
     other = RESULTS.setdefault(task, result)

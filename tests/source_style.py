@@ -128,6 +128,25 @@ def missing_docstrings(modules: list[Module]) -> list[str]:
     ]
 
 
+_PRODUCTS = {"dot", "einsum", "inner", "matmul", "tensordot", "vdot"}
+_LAX_PRODUCTS = {"conv_general_dilated", "dot", "dot_general"}
+
+
+def rounded_products(modules: list[Module]) -> list[str]:
+    """Products without `precision`: GPUs round float32 factors to 10 bits (TF32) by default."""
+    return [
+        f"{module.path}:{node.lineno}: {ast.unparse(node.func)}: give precision='highest'"
+        for module in modules
+        for node in ast.walk(module.tree)
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func).rpartition(".")[2]
+        in {"jnp": _PRODUCTS, "jax.lax": _LAX_PRODUCTS}.get(
+            ast.unparse(node.func).rpartition(".")[0], set()
+        )
+        and "precision" not in {keyword.arg for keyword in node.keywords}
+    ]
+
+
 def missing_annotations(modules: list[Module]) -> list[str]:
     """But of what optimistix names and annotates: the methods of its solvers, except `__init__`."""
     return [
@@ -169,6 +188,7 @@ STYLE_RULES = (
     long_modules,
     missing_docstrings,
     missing_annotations,
+    rounded_products,
 )
 
 # rule, file, source, part of the complaint
@@ -218,6 +238,7 @@ BROKEN_STYLE = [
     (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
     (missing_docstrings, "lensless/psf.py", "x = 1", "begins with a docstring"),
     (missing_docstrings, "lensless/masks/__init__.py", "", "begins with a docstring"),
+    (rounded_products, "learn/loss.py", "y = jnp.einsum('ij,j->i', a, x)", "loss.py:1: jnp.einsum"),
     (
         missing_annotations,
         "lensless/psf.py",

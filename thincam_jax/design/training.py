@@ -186,7 +186,9 @@ class Channel(eqx.Module):
             return CropConvolution(kernel, sensor.pitch, sensor.shape, field)
 
         self.captures = tuple(map(convolution, kernels))
-        whole = jnp.tensordot(jnp.asarray(weights, kernels.dtype), kernels, axes=1)
+        whole = jnp.tensordot(
+            jnp.asarray(weights, kernels.dtype), kernels, axes=1, precision="highest"
+        )
         self.summed = convolution(whole)
 
     def __call__(self, image: Float[Array, "v u"]) -> Float[Array, "y x"]:

@@ -80,7 +80,7 @@ class FringeFilter(eqx.Module):
     def _image(self, captures: Float[Array, "capture y x"]) -> Float[Array, "m n"]:
         if len(self.weights) == 2:  # four cancel the whole background, two only its mean
             captures = captures - jnp.mean(captures, axis=(1, 2), keepdims=True)
-        scanned = jnp.tensordot(self.weights, as_complex(captures), axes=1)
+        scanned = jnp.tensordot(self.weights, as_complex(captures), axes=1, precision="highest")
         padded = self.inverse.shape
         margins = [(0, p - s) for p, s in zip(padded, scanned.shape, strict=True)]
         spectrum = jnp.fft.fft2(jnp.pad(scanned, margins)) * self.inverse

@@ -52,7 +52,7 @@ def estimate_noise(
     black, full = (jnp.sum(windows == e[..., None], axis=0) > _AT_ENDS for e in (least, most))
     shown = jnp.all(_windows(known), axis=0) & ~full
     stencil = jnp.asarray(np.outer((1, -2, 1), (1, -2, 1)).ravel(), capture.dtype)
-    detail = jnp.tensordot(stencil, windows, axes=1)
+    detail = jnp.tensordot(stencil, windows, axes=1, precision="highest")
     key = jax.random.key(0)
     spread = jax.random.uniform(key, detail.shape[-1:], detail.dtype, -0.5, 0.5)
     detail = jnp.abs(detail + spread * step[..., None])

@@ -364,7 +364,7 @@ class Recording(Module):
             kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
         return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
 
-    def synthesis_rows(self, synthesis) -> tuple[np.ndarray, list[float]]:
+    def synthesis_rows(self, synthesis: Any) -> tuple[np.ndarray, list[float]]:
         """The matrix (channel × capture) of a synthesis, and the enlargement of each capture."""
         model = self.imaging_model
         if isinstance(model, Cameras):

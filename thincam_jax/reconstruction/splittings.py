@@ -310,12 +310,12 @@ def _cosines(planes: int) -> np.ndarray:
 
 def _to_modes(spectrum):
     matrix = jnp.asarray(_cosines(spectrum.shape[-3]), spectrum.dtype)
-    return jnp.einsum("mp,...pvu->...mvu", matrix, spectrum)
+    return jnp.einsum("mp,...pvu->...mvu", matrix, spectrum, precision="highest")
 
 
 def _from_modes(spectrum):
     matrix = jnp.asarray(_cosines(spectrum.shape[-3]), spectrum.dtype)
-    return jnp.einsum("mp,...mvu->...pvu", matrix, spectrum)
+    return jnp.einsum("mp,...mvu->...pvu", matrix, spectrum, precision="highest")
 
 
 class DirectSplitting(AbstractSplitting):

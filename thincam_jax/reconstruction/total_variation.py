@@ -117,7 +117,9 @@ class TotalVariation(AbstractRegulariser):
                 'use "joint" or "none"'
             )
         matrix = jnp.asarray(OPPONENT.T if back else OPPONENT, dtype=slopes[0].dtype)
-        return tuple(jnp.einsum("dc,...czyx->...dzyx", matrix, s) for s in slopes)
+        return tuple(
+            jnp.einsum("dc,...czyx->...dzyx", matrix, s, precision="highest") for s in slopes
+        )
 
     def _channel_weights(self, dtype):
         if self.coupling != "opponent":

@@ -165,7 +165,7 @@ class WienerSynthesis(eqx.Module):
     def _image(self, captures: Float[Array, "capture y x"], variance: Float[Array, " capture"]):
         mean = jnp.sum(captures * self.uniform) / jnp.sum(self.uniform**2)
         contrast = captures - mean * self.uniform
-        channels = jnp.tensordot(self.synthesis, contrast, axes=1)
+        channels = jnp.tensordot(self.synthesis, contrast, axes=1, precision="highest")
         noise = self.synthesis**2 @ variance
         spectra = jnp.stack(
             [
@@ -298,7 +298,7 @@ def _convolve(convolution: CropConvolution, field: Float[Array, "m n"]) -> Float
 @functools.partial(jax.jit, static_argnames=("ratio", "padded"))
 def _channel_spectrum(weights, kernels, pitch, ratio: float, padded: tuple[int, int]):
     """Response of a channel on the reference scale."""
-    kernel = register(jnp.tensordot(weights, kernels, axes=1), ratio)
+    kernel = register(jnp.tensordot(weights, kernels, axes=1, precision="highest"), ratio)
     # Enlarged, a kernel spreads the same light over ratio² of its area.
     area = pitch.astype(kernel.dtype) ** 2 / ratio**2
     return _embedded_spectrum(kernel, padded) * as_complex(area)
@@ -432,7 +432,7 @@ def _contrast(captures, matrix: np.ndarray, noise_variance) -> float:
         variances = given_variances(noise_variance, flat)
     ratios = []
     for row in matrix:
-        channel = jnp.tensordot(jnp.asarray(row, flat.dtype), flat, axes=1)
+        channel = jnp.tensordot(jnp.asarray(row, flat.dtype), flat, axes=1, precision="highest")
         noise = jnp.sum(jnp.asarray(row**2, flat.dtype) * variances)
         power = jnp.maximum(jnp.mean(channel**2) - noise, 0)
         ratios.append(float(jnp.sqrt(power / noise)) if noise > 0 else float("inf"))

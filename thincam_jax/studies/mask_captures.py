@@ -115,7 +115,9 @@ def channels_of(
     setting: Setting, compared: ComparedMask, psfs: Float[Array, "capture k l"]
 ) -> list[CropConvolution]:
     """The camera of each sum of captures."""
-    sums = jnp.tensordot(jnp.asarray(compared.weights, psfs.dtype), psfs, axes=1)
+    sums = jnp.tensordot(
+        jnp.asarray(compared.weights, psfs.dtype), psfs, axes=1, precision="highest"
+    )
     shape = setting.sensor.shape
     return [CropConvolution(h[None], setting.pitch, shape, setting.field) for h in sums]
 
@@ -145,8 +147,8 @@ def capture(
     matrix = jnp.asarray(compared.weights, images.dtype)
     variance = jnp.mean(each @ matrix.T**2, axis=-1)
     even = camera(jnp.ones((len(psfs), *field), images.dtype))
-    level = jnp.einsum("kyx,skyx->s", even, images) / jnp.sum(even**2)
-    return Seen(jnp.einsum("ck,skyx->scyx", matrix, images), variance, level)
+    level = jnp.einsum("kyx,skyx->s", even, images, precision="highest") / jnp.sum(even**2)
+    return Seen(jnp.einsum("ck,skyx->scyx", matrix, images, precision="highest"), variance, level)
 
 
 def best_linear(

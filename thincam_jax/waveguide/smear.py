@@ -116,7 +116,7 @@ def _parts(light, ends, samples: int):
     """Means of `samples` equal parts of a distribution, (sample, 2), and its sum."""
     total = jnp.sum(light)
     share = light / jnp.where(total > 0, total, 1)
-    middle = share @ ends
+    middle = jnp.matmul(share, ends, precision="highest")
     below = jnp.concatenate([jnp.zeros(1, share.dtype), jnp.cumsum(share)])
     moments = jnp.cumsum(share[:, None] * (ends - middle), axis=0)
     moments = jnp.concatenate([jnp.zeros((1, 2), share.dtype), moments])

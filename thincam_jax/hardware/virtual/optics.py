@@ -181,7 +181,7 @@ def _averaged(
         """Averages of F_r conj(F_s), r ≤ s, of the terms' one-dimensional fields."""
         one = product(fields[:nodes], as_complex(profiles))
         products = one[..., lower] * jnp.conj(one[..., upper])
-        return jnp.tensordot(as_complex(shares), products, axes=1).T
+        return jnp.tensordot(as_complex(shares), products, axes=1, precision="highest").T
 
     rows, columns = (pairs(f, p) for f, p in zip(along, terms, strict=True))
     weights = as_complex(jnp.asarray(np.where(lower == upper, 1.0, 2.0), grid.pitch.dtype))

@@ -134,10 +134,10 @@ def adjoint_error(
     noise = [
         jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(others, leaves, strict=True)
     ]
-    forward = sum(jnp.vdot(a, b) for a, b in zip(leaves, noise, strict=True))
+    forward = sum(jnp.vdot(a, b, precision="highest") for a, b in zip(leaves, noise, strict=True))
     returned = operator.adjoint(jax.tree.unflatten(structure, noise))
     _require_result("the adjoint", [returned.shape], [operator.in_shape])
-    backward = jnp.vdot(image, returned)
+    backward = jnp.vdot(image, returned, precision="highest")
     scale = _length(leaves) * _length(noise)
     return jnp.abs(forward - backward) / jnp.where(scale == 0, 1, scale)
 

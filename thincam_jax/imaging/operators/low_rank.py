@@ -103,7 +103,7 @@ def _mean_power(operator: LowRank):
     maps = operator.weights.reshape(len(operator.weights), -1)
     spectra, columns = operator.convolution.spectrum, operator.convolution.window[1]
     joined = product(maps, maps.T) / maps.shape[1]
-    mixed = jnp.tensordot(joined.astype(spectra.dtype), spectra, 1)
+    mixed = jnp.tensordot(joined.astype(spectra.dtype), spectra, 1, precision="highest")
     return jnp.sum(plane_mean((spectra.conj() * mixed).real, columns))
 
 

@@ -113,7 +113,7 @@ def draw_crops(
         return jax.lax.dynamic_slice(tiles, (tile, *place, 0), (1, crop, crop, 3))[0]
 
     mixture = jax.random.dirichlet(next(keys), jnp.ones(3, tiles.dtype), (batch,), tiles.dtype)
-    clean = jnp.einsum("byxc,bc->byx", jax.vmap(cut)(chosen, corner), mixture)
+    clean = jnp.einsum("byxc,bc->byx", jax.vmap(cut)(chosen, corner), mixture, precision="highest")
     turned = jax.random.bernoulli(next(keys), shape=(3, batch, 1, 1))
     clean = jnp.where(turned[0], clean[:, ::-1], clean)
     clean = jnp.where(turned[1], clean[:, :, ::-1], clean)

@@ -112,4 +112,6 @@ def _kernel(inputs: int, outputs: int, side: int, key: PRNGKeyArray) -> Array:
 def _convolved(x: Array, kernel: Array, stride: int = 1) -> Array:
     padding = "SAME" if kernel.shape[-1] == 3 else "VALID"
     kernel = kernel.astype(x.dtype)
-    return jax.lax.conv_general_dilated(x[None], kernel, (stride, stride), padding)[0]
+    return jax.lax.conv_general_dilated(
+        x[None], kernel, (stride, stride), padding, precision="highest"
+    )[0]

@@ -68,7 +68,7 @@ def _example(network: RefocusNetwork, one: Batch) -> Examples:
     return Examples(
         prepared(network, last, stack, given),
         stand,
-        jnp.einsum("klp,lpyx->kyx", shares, one.emission) / unit,
+        jnp.einsum("klp,lpyx->kyx", shares, one.emission, precision="highest") / unit,
         one.image / unit,
         one.all_in_focus / unit,
         one.inverse,

@@ -70,7 +70,7 @@ class Cleaned(eqx.Module):
 
     def inverse_distance(self, stand: Stand) -> Float[Array, "y x"]:
         """1/t of each pixel, 1/mm: the planes' mean by their shares."""
-        return jnp.tensordot(stand.inverse, self.share, axes=1)
+        return jnp.tensordot(stand.inverse, self.share, axes=1, precision="highest")
 
 
 class DistanceMap(Module):
@@ -265,7 +265,7 @@ def prepared(
     radius = camera.defocus_radius(stand.inverse - stand.inverse[stand.number])
     lens = jnp.sum(lens_blur(tied, radius, camera.largest_blur), axis=0, keepdims=True)
     total = jnp.sum(tied, axis=0, keepdims=True)
-    relative = jnp.tensordot(stand.place, tied, axes=1)
+    relative = jnp.tensordot(stand.place, tied, axes=1, precision="highest")
     told = constant_images(tied, noise_level(sigma), stand.position)
     return jnp.concatenate([relative, lens, total, sharp, told])
 
@@ -273,9 +273,9 @@ def prepared(
 def read_images(prior: UNet, images: Float[Array, "image y x"], stand: Stand) -> Cleaned:
     """Output of a U-Net for the images of a step."""
     places, found = len(stand.place), prior(images)
-    shares = jnp.tensordot(stand.place.T, found[places:-3], axes=1)
+    shares = jnp.tensordot(stand.place.T, found[places:-3], axes=1, precision="highest")
     return Cleaned(
-        jnp.tensordot(stand.place.T, images[:places] + found[:places], axes=1),
+        jnp.tensordot(stand.place.T, images[:places] + found[:places], axes=1, precision="highest"),
         images[places] + found[-3],
         images[places + 1] + found[-2],
         jax.nn.softmax(shares, axis=0),

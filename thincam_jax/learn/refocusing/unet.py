@@ -21,7 +21,9 @@ class Convolution(eqx.Module):
 
     def __call__(self, image: Float[Array, "in y x"]) -> Float[Array, "out y x"]:
         weight = self.weight.astype(image.dtype)
-        out = jax.lax.conv_general_dilated(image[None], weight, (1, 1), "SAME")[0]
+        out = jax.lax.conv_general_dilated(
+            image[None], weight, (1, 1), "SAME", precision="highest"
+        )[0]
         return out + self.bias.astype(image.dtype)
 
 

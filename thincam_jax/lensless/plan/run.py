@@ -135,7 +135,9 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
     with allow(plan.method.float_type, camera, scene):
         camera, scene = cast((camera, scene), plan.method.float_type)
         fields = jnp.stack([project(camera, p, plan.field_shape) for p in scene.planes])
-        mixed = jnp.tensordot(jnp.asarray(plan.mixing, fields.dtype), fields, axes=1)
+        mixed = jnp.tensordot(
+            jnp.asarray(plan.mixing, fields.dtype), fields, axes=1, precision="highest"
+        )
         light = tuple(zip(plan.wavelengths, plan.weights, strict=True))
         total = jnp.zeros((), fields.dtype)
         for distance, field in zip(plan.distances, mixed, strict=True):

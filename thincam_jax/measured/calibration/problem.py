@@ -101,7 +101,7 @@ class FitState(eqx.Module):
         else:
             turned = functools.partial(self._psf, pixel_integration, grid)
             h = jax.lax.map(turned, self.synthesis.phases)
-            h = jnp.tensordot(self.synthesis.weights, h, axes=1)
+            h = jnp.tensordot(self.synthesis.weights, h, axes=1, precision="highest")
         return self.background * self.flat + self.gain * h
 
     def _psf(self, pixel_integration: bool, grid: Grid | None, phase) -> Float[Array, "y x"]:

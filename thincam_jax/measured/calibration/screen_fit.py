@@ -423,7 +423,7 @@ def _model(state: _State, problem: _Problem):
     points = rays.points[..., None, :2] + offsets
     down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0))
     weight = state.gain * problem.smear.weight(rays.weight) / problem.full / offsets.shape[2]
-    return jnp.einsum("op,opsy,opsx->pyx", weight, down, across)
+    return jnp.einsum("op,opsy,opsx->pyx", weight, down, across, precision="highest")
 
 
 def _parts(points, plane: ObjectPlane, axis: int, size, blur):

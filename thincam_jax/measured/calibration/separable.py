@@ -202,7 +202,7 @@ def _held_out_errors(images, captures, pair) -> np.ndarray:
 @jax.jit
 def _residual(images, captures, pair):
     """Of captures, relative."""
-    seen = jnp.einsum("kym,jmn,kxn->jyx", pair[0], images, pair[1])
+    seen = jnp.einsum("kym,jmn,kxn->jyx", pair[0], images, pair[1], precision="highest")
     size = jnp.sqrt(jnp.sum(captures**2))
     return jnp.sqrt(jnp.sum((seen - captures) ** 2)) / jnp.where(size > 0, size, 1)
 
@@ -211,14 +211,17 @@ def _residual(images, captures, pair):
 def _image_error(images, captures, pair):
     """1 − correlation of images with their linear estimates, by the best of some ridges."""
     left, right = pair
-    grams = (jnp.einsum("kym,lym->kl", part, part) for part in pair)
+    grams = (jnp.einsum("kym,lym->kl", part, part, precision="highest") for part in pair)
     mean = jnp.sum(math.prod(grams)) / math.prod(images.shape[1:])
-    back = jnp.einsum("kym,jyx,kxn->jmn", left, captures, right)
+    back = jnp.einsum("kym,jyx,kxn->jmn", left, captures, right, precision="highest")
 
     def error(ridge):
         def normal(image):
-            seen = jnp.einsum("kym,jmn,kxn->jyx", left, image, right)
-            return jnp.einsum("kym,jyx,kxn->jmn", left, seen, right) + ridge * mean * image
+            seen = jnp.einsum("kym,jmn,kxn->jyx", left, image, right, precision="highest")
+            return (
+                jnp.einsum("kym,jyx,kxn->jmn", left, seen, right, precision="highest")
+                + ridge * mean * image
+            )
 
         found, _ = jax.scipy.sparse.linalg.cg(normal, back, maxiter=_STEPS)
         off, true = (a - a.mean(axis=(1, 2), keepdims=True) for a in (found, images))
@@ -254,12 +257,12 @@ def _alternate(shown, first, pair, weight, tolerance, iterations: int):
 def _solved(images, captures, other, start, weight):
     """All P_k that fit the captures best for given Q_k, held near those of the start."""
     terms, rows, m = start.shape
-    seen = jnp.einsum("jmn,kxn->jkmx", images, other)
+    seen = jnp.einsum("jmn,kxn->jkmx", images, other, precision="highest")
     seen = seen.reshape(len(images), terms * m, -1)
-    gram = jnp.einsum("jax,jbx->ab", seen, seen)
+    gram = jnp.einsum("jax,jbx->ab", seen, seen, precision="highest")
     hold = weight * jnp.trace(gram) / len(gram) + jnp.finfo(start.dtype).tiny
     flat = jnp.swapaxes(start, 0, 1).reshape(rows, -1)
-    right = jnp.einsum("jax,jyx->ay", seen, captures) + hold * flat.T
+    right = jnp.einsum("jax,jyx->ay", seen, captures, precision="highest") + hold * flat.T
     held = gram + hold * jnp.eye(len(gram), dtype=gram.dtype)
     found = jax.scipy.linalg.solve(held, right, assume_a="pos")
     return found.reshape(terms, m, rows).swapaxes(1, 2)
