@@ -43,7 +43,8 @@ hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
 )
 sensor = tc.Sensor((pixels, pixels), 440 * 4.8 * um / pixels)
-camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5), sensor, 6.0, 10.0)
+places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5, *places), sensor, 6.0, 10.0)
 plane = wg.ObjectPlane((cells, cells), 550.0, 150.0, (0.0, 27.0))
 rays = wg.system_operator(camera, plane)
 where = (np.asarray(rays.rows), np.asarray(rays.columns))
@@ -79,7 +80,7 @@ points = points - np.asarray(plane.centre) + 0.3 * rng.standard_normal(points.sh
 ghosts = GhostPositions(
     np.tile(spots, (3, 1)), points.reshape(-1, 2), np.repeat(np.arange(3), 12), 0.3
 )
-start = wg.SeeThroughCamera(wg.Screen(hologram, 5.1, 1.5), sensor, 6.0, 10.0)
+start = wg.SeeThroughCamera(wg.Screen(hologram, 5.1, 1.5, *places), sensor, 6.0, 10.0)
 free = ("glass_thickness", "slant", "tilt", "object_x", "object_y")
 fit = fit_screen(ghosts, start, plane, free, samples=None)
 glass, error = fit.values["glass_thickness"], fit.standard_errors["glass_thickness"]

@@ -124,6 +124,7 @@ def test_the_cropped_error_is_that_of_the_posterior(dtype):
     np.testing.assert_allclose(found, np.trace(left) / np.trace(scene), rtol=2e-4)
 
 
+@pytest.mark.thorough
 def test_psfs_of_a_setting_are_the_cameras(retrieved):
     """One for each depth and wavelength; together, their mean over the wavelengths."""
     mask = retrieved[1]

@@ -63,6 +63,7 @@ def test_the_noise_of_a_data_step_is_that_of_the_dense_inverse():
         assert abs(left * s / np.sqrt(weight @ np.diag(inverse)) - 1) < 0.2
 
 
+@pytest.mark.thorough
 def test_s_falls_further_where_captures_determine_more():
     """σ of the second step over that of the last: a sixth, or down to the denoiser's least."""
     falls = []

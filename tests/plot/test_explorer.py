@@ -64,6 +64,7 @@ def test_off_the_axis_the_psf_is_that_of_the_point(explorer):
     assert "are about the ray at 12°, 0.0" in angle
 
 
+@pytest.mark.thorough
 def test_at_rest_come_capture_image_and_model(explorer):
     explorer.turn({control.name: control.value for control in explorer.controls})
     view = explorer.view()

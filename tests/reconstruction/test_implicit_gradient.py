@@ -155,6 +155,7 @@ def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
     return result.image, result.iterations, result.converged
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", quick(["planes", "colour", "two"], 2))
 def test_it_is_the_minimiser_of_the_iteration_in_chunks(name):
     given = case(name)

@@ -86,6 +86,7 @@ def test_restart_reaches_in_70_iterations_what_takes_more_than_140_without():
     assert min(plain[:14]) > goal
 
 
+@pytest.mark.thorough
 def test_optimistix_in_one_loop_gives_the_image_of_steps_from_outside():
     problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
     own = solve_fista(problem, image=zeros(problem), iterations=60, tolerance=0.0)

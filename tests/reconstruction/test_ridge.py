@@ -192,6 +192,7 @@ def test_small_brightness_keeps_its_square():
     assert image_precision(jnp.zeros(3)) == 1.0
 
 
+@pytest.mark.thorough
 def test_ridge_of_a_difference_knows_the_brightness_of_the_captures():
     """In the sum the uniform light cancels; the image is upright and has its mean."""
     captures = rig.captures(rig.pair(), rig.picture())
@@ -388,6 +389,7 @@ def test_error_bars_cover_the_truth(count):
     assert 0.93 < covered[0] < 0.97 and covered[1] > covered[0] and errors[0] < 0.7 * errors[1]
 
 
+@pytest.mark.thorough
 def test_error_bars_of_a_scene_finer_than_the_sensor():
     """Half of the modes are not seen; scenes are drawn from the prior, the noise is low."""
     sensor, field, draws = (28, 36), (40, 50), np.random.default_rng(7)

@@ -113,6 +113,7 @@ def test_without_noise_a_filter_estimates_it(result):
     assert clean > noisy + 0.1 > 10
 
 
+@pytest.mark.thorough
 def test_any_solver_reconstructs():
     """The single capture by FISTA sees more of the picture than the mean of the scene."""
     exposures = tc.Exposures(25.0, 3.0, **tiny.LIGHT)

@@ -101,6 +101,7 @@ def test_a_tracer_of_surfaces(tilt):
         np.testing.assert_allclose(rays.wavelength, wavelengths, rtol=1e-13)
 
 
+@pytest.mark.thorough
 def test_single_precision_over_the_crop():
     sts = camera()
     pixels = wg.pixel_centres(sts)[np.linspace(0, 439, 23).astype(int), ::73]

@@ -81,6 +81,7 @@ def test_parts_of_the_band(number):
         np.testing.assert_allclose(ours[1:-1], means[1:-1], atol=0.03 * (2 * order + 1))
 
 
+@pytest.mark.thorough
 def test_the_bragg_wavelength_alone():
     """A thick film of a narrow band smears nothing: the samples lie at the points of `trace`."""
     pixels = jnp.asarray(PIXELS)

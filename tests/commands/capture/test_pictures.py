@@ -69,6 +69,7 @@ def test_pictures_come_back(home):
     assert there["TV"]["targets"] == scores["TV"]["targets"]
 
 
+@pytest.mark.thorough
 def test_a_changed_picture_is_another_plan(home):
     other = np.full((8, 16), 30, np.uint8)
     other[0, 0] = 255

@@ -63,6 +63,7 @@ def test_what_does_not_go_together(files):
     assert "a computed PSF has no dark corner; give --background" in one_line(result)
 
 
+@pytest.mark.thorough
 def test_psf_of_a_mask_larger_than_the_sensor_is_whole(files):
     wide = ("mask.width=5mm", "--set", "object.distance=40mm")
     cameras = read_camera(files["study"], wide[::2], None)

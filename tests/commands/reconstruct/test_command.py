@@ -141,6 +141,7 @@ def test_flip_full_field_and_a_linear_image_alone(grey, tmp_path):
     assert record_of(out)["display"] is None
 
 
+@pytest.mark.thorough
 def test_ridge(grey, tmp_path):
     """Without total variation: its record says so, and what was used in its place."""
     out = tmp_path / "image.npy"

@@ -93,6 +93,7 @@ def test_logarithmic_range_has_equal_ratios(low, high, n):
         assert math.isclose(after / before, ratio, rel_tol=1e-10)
 
 
+@pytest.mark.thorough
 @given(st.text(max_size=30))
 def test_any_text_is_values_or_one_line(text):
     try:

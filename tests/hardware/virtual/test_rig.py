@@ -44,6 +44,7 @@ def modulator(fill_factor=1.0):
     return ModulatorOptics(scene, tc.Sensor((64, 96), 22 * um), PITCH, 6.5, 1e5, fill_factor)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fill_factor", quick([1.0, 0.58], 1))
 def test_the_pixels_shown_are_the_mask_of_a_direct_simulation(fill_factor):
     """Within what 8 bits round off; a pattern of another phase is another capture."""

@@ -223,6 +223,7 @@ def test_phase_pairs_have_no_first_zero():
             assert response.magnitude[around].max() > 0.1 * level
 
 
+@pytest.mark.thorough
 def test_object_side_limits_are_the_sensor_side_ones_magnified():
     limits = near(CONVENTIONAL_5).limits  # on its own plane: t/d = 50
     assert limits.first_zero_object_mm == pytest.approx(

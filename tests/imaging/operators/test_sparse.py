@@ -39,6 +39,7 @@ def test_entries_at_one_place_add_up():
     np.testing.assert_array_equal(dense(Sparse(H, (2,), (3,))), [[0, 3], [0, 0], [4, 0]])
 
 
+@pytest.mark.thorough
 def test_padding_of_a_bcoo_is_left_out():
     """Its indices lie one beyond the matrix; neither values nor slopes come from there."""
     H = sparse_matrix().toarray()

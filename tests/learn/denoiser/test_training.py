@@ -36,6 +36,7 @@ def untrained():
     return create(DenoiserOptions((16, 16), (1, 0)), key=jax.random.key(0))
 
 
+@pytest.mark.thorough
 def test_crops_have_the_noise_that_they_say():
     tiles = jnp.asarray(LESSONS.pictures.tiles)
     draws = [draw_crops(tiles, 8, 16, key) for key in jax.random.split(jax.random.key(3), 32)]
@@ -79,6 +80,7 @@ def whole():
     return train_denoiser(untrained(), LESSONS, OPTIONS)
 
 
+@pytest.mark.thorough
 def test_it_learns_what_holds_for_pictures_that_it_has_not_seen(whole):
     validation = LESSONS.task(0).validation
     before, after = (

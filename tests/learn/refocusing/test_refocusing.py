@@ -223,6 +223,7 @@ def test_a_simulator_by_parts_of_the_mask_agrees_where_nothing_is_hidden(camera)
     assert float(jnp.max(jnp.abs(by_parts - clean))) < 0.05 * float(clean.max())
 
 
+@pytest.mark.thorough
 def test_the_wiener_filter_finds_its_plane(camera):
     """Focused where the scene stands it is closest to it, and its mean is the scene's."""
     planes = Planes(camera)

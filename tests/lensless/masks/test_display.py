@@ -63,6 +63,7 @@ def test_many_cells_are_a_sampled_mask_with_gaps():
     assert float(shadow.sum()) * 0.031**2 == pytest.approx(light, rel=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("height", quick([None, 0.9], 1))
 def test_zones_are_those_of_a_zone_plate_with_pixels(height):
     numbers = {"width": 1.2, "height": height, "centre": CENTRE}

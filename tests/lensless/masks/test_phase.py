@@ -75,6 +75,7 @@ def test_the_rim_is_cut_by_area_and_the_centre_moves():
     )
 
 
+@pytest.mark.thorough
 def test_a_prism_shifts_the_psf_by_its_angle():
     """A ramp along +x bends by sin θ = (n − 1) dh/dx to +x: the flat mask's PSF, d tan θ aside."""
     pitch, sensor = 4 * um, 5 * um
@@ -299,6 +300,7 @@ def test_light_outside_of_the_materials_band_is_refused():
         psf(here, wavelength=250 * nm)
 
 
+@pytest.mark.thorough
 def test_light_beside_the_sensor_does_not_come_back():
     """A prism that bends past the sensor, beyond the window's band limit: nothing wraps round."""
     ramp = np.tile(np.arange(60) * 0.45 * TURN, (40, 1))  # 90 cycles/mm, 0.45 mm at d = 10 mm

@@ -23,6 +23,7 @@ def deep(request):
     return whole, tc.capture(camera(), whole)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("deep", "tolerance", "most_psfs"),
     [

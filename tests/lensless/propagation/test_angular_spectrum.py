@@ -30,6 +30,7 @@ sample = jax.jit(lambda mask, grid: mask.sample(grid))
 carry = jax.jit(propagate)
 
 
+@pytest.mark.thorough
 def test_converges_to_separable(capsys):
     """Hard edges converge like one over the oversampling, and padding lets their steep waves in."""
     expected = exact(MASK, GRID, GENTLE)

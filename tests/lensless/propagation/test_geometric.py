@@ -70,6 +70,7 @@ def test_is_the_limit_of_short_waves():
     assert errors[-1] < 5e-3
 
 
+@pytest.mark.thorough
 def test_pixel_average():
     """Against 200×200 midpoints a pixel; width and centre put the edges between midpoints."""
     shape, pitch, t, width = (11, 14), 0.125, 20.0, 1.0

@@ -222,6 +222,7 @@ def test_single_precision(at):
     assert relative(np.asarray(single, float), exact) < 1e-4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("averaged", [pytest.param(False, marks=pytest.mark.thorough), True])
 def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged):
     camera, at = camera_of(), np.array([5.0, 7.0])
@@ -234,6 +235,7 @@ def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged):
     assert relative(np.asarray(single, float), exact) < 1e-4
 
 
+@pytest.mark.thorough
 def test_light_of_the_open_aperture_is_1():
     """Far inside the shadow, at 20°, by each model."""
     camera = tc.LenslessCamera(tc.Pinhole(3.0), tc.Sensor((5, 6), 20 * um), 2.0)

@@ -136,6 +136,7 @@ def test_angular_spectrum_approaches_it():
     assert fine < 4e-3
 
 
+@pytest.mark.thorough
 def test_choice_meets_the_tolerance():
     """`angular_spectrum`, the only model before, is 4 to 8 % off however many samples it has."""
     camera = camera_of(shape=(56, 45), pitch=5.5 * um)

@@ -116,6 +116,7 @@ def test_nothing_beyond_the_cut_off():
     np.testing.assert_array_equal(value[:, 2:], 0.0)
 
 
+@pytest.mark.thorough
 def test_pixel_average():
     path = Path(WAVELENGTH, DISTANCE, 60.0)
     factor = np.outer(np.sinc(0.03 * V), np.sinc(0.03 * U))

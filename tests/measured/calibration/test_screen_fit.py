@@ -92,6 +92,7 @@ def test_the_smear_is_in_the_model():
     assert "does not explain the positions: χ² is" in without.reasons[0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("names", "reason"),
     [

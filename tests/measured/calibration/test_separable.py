@@ -206,6 +206,7 @@ def test_a_fit_is_never_worse_than_its_start(kind, count, start, glare, gain):
     assert after >= before + gain
 
 
+@pytest.mark.thorough
 def test_single_precision_ends_in_numbers():
     """Nearly uniform images make the equations singular in float32, not in double."""
     rng = np.random.default_rng(5)

@@ -96,6 +96,7 @@ def test_a_near_object_stays_near(brightness):
     assert light[3] < 0.05 * light.sum()
 
 
+@pytest.mark.thorough
 def test_planes_that_are_alike_are_named(recwarn):
     with pytest.warns(AccuracyWarning, match="planes . and . of 4 .* by 0.99.*refocus_sweep"):
         tc.reconstruct(measured(0.2, 0), tc.AdmmTV(iterations=1))
