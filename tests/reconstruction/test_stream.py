@@ -81,6 +81,6 @@ def test_frames_of_cameras(synthesis, model):
     first = tc.Recording(captures, optics, noise_variance=1e-5)
     stream = tc.Stream(first, solver, steps=10)
     for _ in range(30):
-        stream, image = stream.next(1.5 * captures)
+        stream, image = stream.next([1.5 * captures[0], 1.5 * captures[1]])
     alone = tc.reconstruct(tc.Recording(1.5 * captures, optics, noise_variance=1e-5), solver)
     assert relative_l2(image, alone.image) < 1e-3

@@ -84,7 +84,8 @@ class Stream(eqx.Module):
     def next(self, captures: Any) -> tuple["Stream", Float[Array, "*batch y x"]]:
         """The stream after the next captures, and their image."""
         wanted = [c.shape for c in self.recording.captures]
-        given = captures if len(wanted) > 1 or jnp.shape(captures) != wanted[0] else [captures]
+        alone = len(wanted) == 1 and getattr(captures, "shape", None) == wanted[0]
+        given = [captures] if alone else captures
         if [jnp.shape(c) for c in given] != wanted:
             raise ValueError(
                 f"captures have shapes {[jnp.shape(c) for c in given]}, the first recording's "
