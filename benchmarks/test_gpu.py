@@ -130,14 +130,17 @@ def training_step():
 
 
 def psf():
+    """Separable, 1024²."""
     return test_public.psf()[0]
 
 
 def capture():
+    """A photograph of 256², a sensor of 1024²."""
     return test_public.capture()[0]
 
 
 def flatcam():
+    """`Ridge` of a FlatCam's colour capture."""
     return test_public.flatcam()[0]
 
 
@@ -162,7 +165,7 @@ RESULTS = {}
 @pytest.mark.parametrize("device", [CPU, GPU], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.__name__)
 def test_gpu(benchmark, task, device):
-    benchmark.group = f"{task.__name__}: {task.__doc__ or ''}".strip()
+    benchmark.group = f"{task.__name__}: {task.__doc__}"
     with jax.enable_x64(False), jax.default_device(device):
         call = task()
         result = np.asarray(jax.block_until_ready(call()))
