@@ -45,7 +45,7 @@ bench: .venv/.installed-bench ## Measure speed and accuracy.
 	@$(BIN)/python -m pytest benchmarks --benchmark-columns=min,median,stddev,rounds $(ARGS)
 
 bench-gpu: .venv/.installed-bench ## Measure a GPU beside the processor; needs JAX's plugin for the GPU.
-	@JAX_PLATFORMS= $(BIN)/python -m pytest benchmarks/test_gpu.py --benchmark-columns=min,median,stddev,rounds $(ARGS)
+	@JAX_PLATFORMS= $(BIN)/python -m pytest benchmarks/test_gpu.py -rs --benchmark-columns=min,median,stddev,rounds $(ARGS)
 
 docs: .venv/.installed-docs ## Build the documentation into docs/_build; FAST=1 executes no script.
 	@$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build

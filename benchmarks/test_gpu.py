@@ -24,7 +24,8 @@ CPU = jax.devices("cpu")[0]
 try:
     GPU = jax.devices("gpu")[0]
 except RuntimeError:
-    pytest.skip("JAX finds no GPU: pip install 'jax[cuda13]'", allow_module_level=True)
+    GPU = None
+pytestmark = pytest.mark.skipif(GPU is None, reason="JAX finds no GPU: pip install 'jax[cuda13]'")
 
 
 def cameras(phases=(0.0,), field_shape=SHAPE):
