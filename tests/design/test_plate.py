@@ -84,3 +84,13 @@ def test_limits_that_cross_are_refused():
     limits = PlateLimits(changed(index_modulation=0.03), Plate())
     with pytest.raises(ValueError, match="limits of index_modulation are 0.03 to 0.02; give the"):
         find_plate(VIEWING, limits, key=jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"object_width": 1e30}, {"cell": 0.0}, {"snr_db": 1e3}, {"variance": 0.0}]
+)
+def test_a_viewing_out_of_range_is_refused(wrong):
+    """A width of 1e30 mm gave an error that is no number."""
+    (name,) = wrong
+    with pytest.raises(ValueError, match=f"{name} = .* (give|is no)"):
+        Viewing(tc.Sensor((12, 15), 0.02), **wrong)

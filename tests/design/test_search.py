@@ -56,6 +56,7 @@ SOLVERS = pytest.mark.parametrize("solver", ["bfgs", "lbfgsb"])
 ONE_SOLVER = pytest.mark.parametrize("solver", quick(["bfgs", "lbfgsb"], 0))
 
 
+@pytest.mark.thorough
 @ONE_SOLVER
 def test_deepest_of_many(solver):
     """β to 0.1 rad/mm², the value to 1e-4; the second best is another minimum; no value twice."""

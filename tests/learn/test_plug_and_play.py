@@ -91,6 +91,7 @@ def test_noise_that_was_told_wrongly_is_found():
         assert abs(ratio / wrong - 1) < 0.2
 
 
+@pytest.mark.thorough
 def test_with_a_linear_denoiser_it_ends_in_the_fixed_point_of_a_quadratic_problem():
     """f = D M⁻¹(Aᵀwg + μf), for the last s of a long run."""
     s_ends: list[float] = []

@@ -77,6 +77,7 @@ def test_training_goes_on_to_the_same_bits(tmp_path):
         load(tmp_path / STATE.format(1), tiny.camera())
 
 
+@pytest.mark.thorough
 def test_another_camera_is_refused_with_both_numbers(file):
     with pytest.raises(CheckpointError, match=r"camera\.mask\.beta was 13\.0 and is 13\.1 here"):
         load(file, tiny.camera(beta=13.1))

@@ -65,6 +65,7 @@ def test_capture_over_the_field():
     assert np.linalg.norm(np.asarray(found) - exact) < 1e-2 * np.linalg.norm(whole)
 
 
+@pytest.mark.thorough
 def test_the_axis_psf_is_far_off_at_the_corner(fit):
     alone = imaging_operator(CAMERA, 500 * nm, 250.0, field_shape=FIELD)
     dimmed = fall_of_light(*tangents_of(CAMERA, FIELD))[49, 65]

@@ -48,6 +48,7 @@ def test_frequencies_on_the_sensor():
     assert ax.lines[0].get_xdata()[0] == pytest.approx(18.75 / 128)
 
 
+@pytest.mark.thorough
 def test_contrast_side_by_side():
     """Common axes; a curve for the chain, and one for each sum of captures."""
     levels = np.linspace(1e-2, 1e-4, 64)

@@ -115,6 +115,7 @@ def test_filters_over_the_field_divide_by_the_light(solver):
     assert abs(slope) < 0.4 < before
 
 
+@pytest.mark.thorough
 def test_over_the_field_refuses():
     model = tc.PsfMethod("separable", field_tolerance=1.0)
     recording, _ = wide_recording(model)

@@ -14,7 +14,7 @@ from reconstruction import scenes
 from reconstruction.test_admm import case, solved
 
 import thincam_jax as tc
-from helpers import count_traces, finite_difference, quick, relative_l2
+from helpers import count_traces, finite_difference, relative_l2
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.reconstruction.admm import Penalties
 from thincam_jax.reconstruction.implicit_gradient import NeumannSeries, solve_fixed_point
@@ -156,7 +156,7 @@ def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", quick(["planes", "colour", "two"], 2))
+@pytest.mark.parametrize("name", ["planes", "colour", "two"])
 def test_it_is_the_minimiser_of_the_iteration_in_chunks(name):
     given = case(name)
     image, iterations, converged = settled(given.problem)

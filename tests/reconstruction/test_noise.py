@@ -13,14 +13,8 @@ compiled = jax.jit(estimate_noise)
 RNG = np.random.default_rng(9)
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        pytest.param((64, 81), marks=pytest.mark.thorough),
-        pytest.param((111, 50), marks=pytest.mark.thorough),
-        (7, 900),
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("shape", [(64, 81), (111, 50), (7, 900)])
 def test_white_noise_is_measured_without_bias(shape):
     """The mean of 40 estimates is right to 2 %, each one to 20 %; on a smooth picture, too."""
     y, x = (np.arange(n) for n in shape)
@@ -128,6 +122,7 @@ def test_batches_and_compilation():
     np.testing.assert_allclose(values[1, 2], estimate_noise(images[1, 2]))
 
 
+@pytest.mark.thorough
 def test_the_variance_of_each_capture():
     """Averaged over its batch; of one without noise a millionth of the power of all; or else 1."""
     captures = RNG.normal(size=(4, 3, 60, 61)) * np.array([0.5, 2.0, 0.0, 0.0]).reshape(4, 1, 1, 1)

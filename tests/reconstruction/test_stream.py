@@ -60,12 +60,13 @@ def test_bad_input():
         tc.Stream(recording, tc.AdmmTV("sure"))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("synthesis", "model"),
     [
         (None, "separable"),
         ([[1, -1], [1, 1]], "separable"),
-        pytest.param(None, tc.PsfMethod(field_tolerance=0.1), marks=pytest.mark.thorough),
+        (None, tc.PsfMethod(field_tolerance=0.1)),
     ],
     ids=["captures", "contrasts", "field"],
 )

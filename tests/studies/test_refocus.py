@@ -23,6 +23,7 @@ def result(study):
     return result
 
 
+@pytest.mark.thorough
 def test_both_objects_are_found(result):
     assert list(result.objects) == ["near", "far"]
     for found in result.objects.values():

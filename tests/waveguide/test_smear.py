@@ -8,7 +8,6 @@ import pytest
 from waveguide.setting import camera, hologram
 
 import thincam_jax as tc
-from helpers import quick
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators import adjoint_error
 from thincam_jax.units import nm, um
@@ -53,7 +52,8 @@ def lights(across, wavelengths, orders):
     return np.mean([e**2 * (1 - e) ** powers for e in eta], axis=0)
 
 
-@pytest.mark.parametrize("number", quick(range(3), 2))
+@pytest.mark.thorough
+@pytest.mark.parametrize("number", range(3))
 def test_parts_of_the_band(number):
     """Sums, means and deciles of 4001 wavelengths weighted by η²(1−η)^i."""
     sts, film, pixel = camera(), hologram(), PIXELS[number]

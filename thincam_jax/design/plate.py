@@ -115,6 +115,8 @@ class Viewing(eqx.Module):
     - `snr_db`: of the captures of the default plate; another's follows from its light.
     - `mean`, `variance`: of the object's radiance. `prior`: how its variance is spread,
       by default `PowerLaw(2.5)`.
+
+    **Errors**: ValueError, one line, for what is out of range.
     """
 
     sensor: Sensor
@@ -125,6 +127,13 @@ class Viewing(eqx.Module):
     mean: float = 0.5
     variance: float = 0.08
     prior: PowerLaw | None = None
+
+    def __check_init__(self):
+        for name in ("object_distance", "object_width", "cell"):
+            checks.positive(name, getattr(self, name), "mm")
+        checks.decibels("snr_db", self.snr_db)
+        checks.non_negative("mean", self.mean, "a ratio")
+        checks.positive("variance", self.variance, "a ratio")
 
 
 class Judged(Module):

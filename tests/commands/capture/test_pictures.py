@@ -92,6 +92,7 @@ def test_files_that_do_not_fit(home, asked, line):
     assert line in one_line(call("capture", "pictures.yaml", "--out", "x.zarr", "--set", asked))
 
 
+@pytest.mark.thorough
 def test_a_matrix_of_other_cells_is_told_of(home):
     text = (home / "pictures.zarr/config.yaml").read_text("utf-8")
     store = home / "none.zarr"

@@ -48,6 +48,7 @@ def test_it_is_as_good_as_a_perfect_measurement(files):
     assert "beta=25 rad/mm²" in psf and "distance=3 mm" in psf and "object at 100 mm" in psf
 
 
+@pytest.mark.thorough
 def test_what_does_not_go_together(files):
     for known, message in (
         ((), "give either --psf, a measured PSF, or --camera"),

@@ -49,6 +49,7 @@ def test_a_capture_is_focused_and_what_is_not_sure_is_marked(files):
     assert skimage.io.imread(files / "image-unsure.png").std() > 1
 
 
+@pytest.mark.thorough
 def test_what_does_not_fit_is_one_line(files):
     for given, message in (
         ((call(files, distance="3 m")), "distance = 3000 mm lies outside of what the network was"),

@@ -13,7 +13,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from helpers import ROOT, quick
+from helpers import ROOT
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import LEAST, MOST, DenoiserOptions, create, load_network
 from thincam_jax.learn.denoiser.pictures import TILE, drawn, photographs, split
@@ -118,7 +118,8 @@ def killed(folder):
         child.send_signal(signal.SIGKILL)
 
 
-@pytest.mark.parametrize("interrupted", quick([stopped, killed], 0))
+@pytest.mark.thorough
+@pytest.mark.parametrize("interrupted", [stopped, killed])
 def test_an_interrupted_training_ends_with_the_same_numbers(interrupted, whole, tmp_path):
     interrupted(tmp_path)
     steps = []

@@ -190,7 +190,7 @@ def test_zone_models_refuse_cells():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", ["mura", pytest.param("lenslets", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("name", ["mura", "lenslets"])
 def test_models_are_selected(name):
     """The prediction is kept, and the models offered are those that can hold the mask."""
     camera = tc.LenslessCamera(families.masks()[name], SENSOR, DISTANCE)

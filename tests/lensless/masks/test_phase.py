@@ -90,6 +90,7 @@ def test_a_prism_shifts_the_psf_by_its_angle():
     assert relative_l2(psf(camera(down), **options)[16:], still[:-16]) < 0.01
 
 
+@pytest.mark.thorough
 def test_a_sinusoidal_grating_has_bessel_orders():
     """φ = m cos(2πx/Λ): the order q, λqd/Λ aside, holds J_q(m)² of the light."""
     depth, period, pitch = 1.8, 20 * um, 1 * um

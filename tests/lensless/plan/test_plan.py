@@ -27,12 +27,12 @@ def deep(request):
 @pytest.mark.parametrize(
     ("deep", "tolerance", "most_psfs"),
     [
-        pytest.param((16, 11), 0.3, 1, marks=pytest.mark.thorough),
+        ((16, 11), 0.3, 1),
         ((6, 5), 1e-2, 20),
-        pytest.param((16, 11), 1e-2, 20, marks=pytest.mark.thorough),
-        pytest.param((32, 31), 0.1, 4, marks=pytest.mark.thorough),
-        pytest.param((32, 31), 1e-2, 20, marks=pytest.mark.thorough),
-        pytest.param((32, 31), 1e-3, 150, marks=pytest.mark.thorough),
+        ((16, 11), 1e-2, 20),
+        ((32, 31), 0.1, 4),
+        ((32, 31), 1e-2, 20),
+        ((32, 31), 1e-3, 150),
     ],
     indirect=["deep"],
 )
@@ -297,6 +297,7 @@ def test_a_plan_notices_other_light_and_larger_planes():
         tc.plan(camera(), few.planes[0], tolerance=0.1)
 
 
+@pytest.mark.thorough
 def test_another_phase_may_use_the_plan():
     """The exposures of fringe scanning share one."""
     few = scene(2, 2)

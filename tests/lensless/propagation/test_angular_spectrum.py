@@ -53,6 +53,7 @@ def test_converges_to_separable(capsys):
     assert error[2.0, 1] < 0.03 and error[2.0, 3] < 4e-3 and error[2.0, 9] < 1.5e-3
 
 
+@pytest.mark.thorough
 def test_finite_object_distance():
     """The exact spherical wave and the scale M² lead to the same PSF as Eq 3.2's scaling."""
     path = Path(WAVELENGTH, 20.0, 60.0)
@@ -87,6 +88,7 @@ def test_steep_edge_waves_are_beyond_fresnel():
     assert relative_l2(fourier, direct) < 1e-3
 
 
+@pytest.mark.thorough
 def test_sampled_mask_is_the_aperture_sampled():
     """The same samples as a `SampledMask`, whose cells are the mask plane's: the same PSF."""
     plane = tc.Grid((54, 56), 0.01)

@@ -223,7 +223,7 @@ def test_single_precision(at):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("averaged", [pytest.param(False, marks=pytest.mark.thorough), True])
+@pytest.mark.parametrize("averaged", [False, True])
 def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged):
     camera, at = camera_of(), np.array([5.0, 7.0])
     light = {"wavelength": np.float64(500 * nm), "object_distance": 100.0}

@@ -93,13 +93,8 @@ def test_a_round_zone_plate_focuses():
     assert float(psf(camera, np.inf)[0, 0]) == pytest.approx(400, rel=1e-7)
 
 
-@pytest.mark.parametrize(
-    "average",
-    [
-        pytest.param(False, id="points"),
-        pytest.param(True, id="average", marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
 def test_the_interpolated_profile(average):
     """As the value at each point, with few fringes a pixel and with many; off the axis, too."""
     nodes = LATTICE_POINTS if average else None

@@ -41,7 +41,8 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("name", quick(["fringe_scanning", "wiener", "admm_tv"], 1))
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["fringe_scanning", "wiener", "admm_tv"])
 def test_images_are_those_of_reconstruct(recording, name):
     solver, done = SOLVERS[name], []
     sweep = refocus_sweep(recording, DISTANCES[:3], solver, callback=done.append)
