@@ -103,7 +103,7 @@ def to_display(
 
 def _gains(image: np.ndarray, white_balance: WhiteBalance) -> np.ndarray:
     channels = image.shape[0]
-    if white_balance is None or (channels == 1 and white_balance == "grey_world"):
+    if white_balance is None:
         return np.ones(channels)
     if isinstance(white_balance, str):
         if white_balance != "grey_world":
