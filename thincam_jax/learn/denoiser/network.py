@@ -98,19 +98,18 @@ class Denoiser(Module):
 
 def _checked(image: Numbers, sigma: Numbers) -> tuple[Array, Array]:
     wanted = "give finite numbers of shape (*batch, y, x)"
-    if jnp.ndim(image) < 2 or 0 in jnp.shape(image):
-        raise ValueError(f"image has shape {jnp.shape(image)}; {wanted}, not empty")
-    if jnp.result_type(image).kind not in "fiu":
-        raise TypeError(f"image of {jnp.result_type(image)} is not real; {wanted}")
+    image, sigma = checks.array("image", image), checks.array("sigma", sigma)
+    if image.ndim < 2 or 0 in image.shape:
+        raise ValueError(f"image has shape {image.shape}; {wanted}, not empty")
     if not checks.is_traced(image) and not np.isfinite(np.asarray(image)).all():
         raise ValueError(f"image holds NaN or infinity; {wanted}")
-    image = jnp.asarray(image)
-    if not jnp.issubdtype(image.dtype, jnp.floating):
-        image = image.astype(float)
-    batch, shape = image.shape[:-2], jnp.shape(sigma)
-    if shape not in ((), batch):
-        raise ValueError(f"sigma has shape {shape}; give one number, or one an image: {batch}")
-    sigma = checks.positive_all("sigma", jnp.asarray(sigma, image.dtype), "the image's unit")
+    image = checks.as_array(image, floating=True)
+    batch = image.shape[:-2]
+    if sigma.shape not in ((), batch):
+        raise ValueError(
+            f"sigma has shape {sigma.shape}; give one number, or one an image: {batch}"
+        )
+    sigma = checks.positive_all("sigma", sigma.astype(image.dtype), "the image's unit")
     return image, jnp.broadcast_to(sigma, batch)
 
 
