@@ -86,6 +86,13 @@ def test_limits_that_cross_are_refused():
         find_plate(VIEWING, limits, key=jax.random.key(0))
 
 
+@pytest.mark.parametrize("name", ["film_thickness", "index_modulation", "lens_distance"])
+def test_a_plate_out_of_range_is_refused(name):
+    """A film without thickness gave an error that is no number."""
+    with pytest.raises(ValueError, match=f"{name} = 0.* is not positive; give {name} > 0"):
+        Plate(**{name: 0})
+
+
 @pytest.mark.parametrize(
     "wrong", [{"object_width": 1e30}, {"cell": 0.0}, {"snr_db": 1e3}, {"variance": 0.0}]
 )

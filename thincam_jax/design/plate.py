@@ -53,6 +53,14 @@ def _number(name: str, value: Any) -> Float[Array, ""]:
     return value if isinstance(value, jax.Array) else jnp.asarray(value, float)
 
 
+def _length(name: str, value: Any) -> Float[Array, ""]:
+    return _number(name, checks.positive(name, value, "mm"))
+
+
+def _modulation(name: str, value: Any) -> Float[Array, ""]:
+    return _number(name, checks.positive(name, value, ""))
+
+
 class Plate(Module):
     """Free parameters of a see-through-screen camera; lengths in mm, the angle in rad.
 
@@ -60,20 +68,22 @@ class Plate(Module):
     """
 
     glass_thickness: Float[Array, ""] = eqx.field(
-        default=5.0, converter=quantity("mm", check=_number)
+        default=5.0, converter=quantity("mm", check=_length)
     )
     reference_angle: Float[Array, ""] = eqx.field(
         default=61.2 * deg, converter=quantity("rad", check=_number)
     )
     film_thickness: Float[Array, ""] = eqx.field(
-        default=16 * um, converter=quantity("mm", check=_number)
+        default=16 * um, converter=quantity("mm", check=_length)
     )
-    index_modulation: Float[Array, ""] = eqx.field(default=0.02, converter=quantity(check=_number))
+    index_modulation: Float[Array, ""] = eqx.field(
+        default=0.02, converter=quantity(check=_modulation)
+    )
     lens_distance: Float[Array, ""] = eqx.field(
-        default=10.0, converter=quantity("mm", check=_number)
+        default=10.0, converter=quantity("mm", check=_length)
     )
     focal_distance: Float[Array, ""] = eqx.field(
-        default=6.0, converter=quantity("mm", check=_number)
+        default=6.0, converter=quantity("mm", check=_length)
     )
 
     def camera(
