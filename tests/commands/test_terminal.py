@@ -93,6 +93,7 @@ def test_a_long_value_is_cut(entry, tmp_path):
     assert result.exit_code == 2 and len(line) < 700, line
 
 
+@pytest.mark.thorough
 def test_results_as_json(tmp_path):
     """An object in a line, and nothing else; the table holds the numbers that are not rounded."""
     file = mini.write(tmp_path)

@@ -64,6 +64,7 @@ def test_a_start_a_hundred_times_off_finds_the_same():
     assert float(again.problem.tau) == pytest.approx(float(chosen.problem.tau), rel=0.05)
 
 
+@pytest.mark.thorough
 def test_discrepancy_makes_the_residual_of_the_valid_pixels_as_large_as_the_noise():
     problem, _ = posed()
     masked = jnp.ones((1, *SENSOR)).at[:, :15].set(0.0)

@@ -93,6 +93,7 @@ def test_cameras_over_the_field_explain_their_capture():
     assert tc.choose_solver(recording)[0].name == "fista"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("solver", [tc.Wiener(), tc.FringeScanning()])
 def test_filters_over_the_field_divide_by_the_light(solver):
     """A bright field of ±20° is even again; before, its corners fell to cos⁴θ."""

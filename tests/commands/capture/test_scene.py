@@ -31,6 +31,7 @@ def file(tmp_path_factory):
     return tiny.write(tmp_path_factory.mktemp("scene"), yaml.safe_dump(SCENE))
 
 
+@pytest.mark.thorough
 def test_merged_frames_are_those_of_a_direct_simulation(file):
     """Within the noise that the merge says; the long exposure is saturated in part."""
     store, out = file.with_name("a.zarr"), file.with_name("out")

@@ -167,6 +167,7 @@ def counted(monkeypatch):
     return taken
 
 
+@pytest.mark.thorough
 def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
     study, path, scores, texts = whole
     folder = RunFolder(home / "interrupted")

@@ -148,6 +148,7 @@ def psf(at, beta=25.0, distance=6.5, wavelength=500 * nm, object_distance=100.0)
 anywhere = jax.jit(lambda at, distance: psf(at, object_distance=distance))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("distance", [INF, 100.0])
 def test_on_the_axis_it_is_the_psf_of_the_axis(distance):
     expected = tc.psf(camera_of(), wavelength=500 * nm, object_distance=distance)
