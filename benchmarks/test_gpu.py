@@ -28,11 +28,11 @@ except RuntimeError:
 pytestmark = pytest.mark.skipif(GPU is None, reason="JAX finds no GPU: pip install 'jax[cuda13]'")
 
 
-def cameras(phases=(0.0,), field_shape=SHAPE):
+def cameras(phases):
     masks = [tc.FresnelZoneAperture(20.0, phase, width=2.8) for phase in phases]
     sensor = tc.Sensor(SHAPE, 5.5 * um)
     many = [tc.LenslessCamera(mask, sensor, 6.5) for mask in masks]
-    return tc.Cameras(many, wavelength=500 * nm, object_distance=250.0, field_shape=field_shape)
+    return tc.Cameras(many, wavelength=500 * nm, object_distance=250.0, field_shape=SHAPE)
 
 
 def recording(phases=(0.0,), copies=1):
@@ -126,7 +126,7 @@ def training_step():
     noisy = clean + 0.1 * jnp.asarray(random.normal(size=clean.shape), jnp.float32)
     crops = Crops(clean, noisy, sigma, jnp.mean(noisy, axis=(1, 2)))
     step = eqx.filter_jit(eqx.filter_value_and_grad(lambda n: loss(n, crops)[0]))
-    network = jax.tree.map(lambda a: jnp.asarray(a) if eqx.is_array_like(a) else a, network)
+    network = jax.tree.map(jnp.asarray, network)
     return lambda: step(network)[0]
 
 

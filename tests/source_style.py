@@ -128,8 +128,10 @@ def missing_docstrings(modules: list[Module]) -> list[str]:
     ]
 
 
-_PRODUCTS = {"dot", "einsum", "inner", "matmul", "tensordot", "vdot"}
-_LAX_PRODUCTS = {"conv_general_dilated", "dot", "dot_general"}
+_PRODUCTS = {
+    *(f"jnp.{name}" for name in ("dot", "einsum", "inner", "matmul", "tensordot", "vdot")),
+    *(f"jax.lax.{name}" for name in ("conv_general_dilated", "dot", "dot_general")),
+}
 
 
 def rounded_products(modules: list[Module]) -> list[str]:
@@ -139,10 +141,7 @@ def rounded_products(modules: list[Module]) -> list[str]:
         for module in modules
         for node in ast.walk(module.tree)
         if isinstance(node, ast.Call)
-        and ast.unparse(node.func).rpartition(".")[2]
-        in {"jnp": _PRODUCTS, "jax.lax": _LAX_PRODUCTS}.get(
-            ast.unparse(node.func).rpartition(".")[0], set()
-        )
+        and ast.unparse(node.func) in _PRODUCTS
         and "precision" not in {keyword.arg for keyword in node.keywords}
     ]
 

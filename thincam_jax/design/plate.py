@@ -17,7 +17,6 @@ object, and what changes over a few ghosts' distance, are left out.
 
 import functools
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -48,19 +47,6 @@ _FREQUENCIES = (32, 16)
 _MARGIN = 0.02
 
 
-def _number(name: str, value: Any) -> Float[Array, ""]:
-    # Not weakly typed, so that every plate is of one compiled program.
-    return value if isinstance(value, jax.Array) else jnp.asarray(value, float)
-
-
-def _length(name: str, value: Any) -> Float[Array, ""]:
-    return _number(name, checks.positive(name, value, "mm"))
-
-
-def _modulation(name: str, value: Any) -> Float[Array, ""]:
-    return _number(name, checks.positive(name, value, ""))
-
-
 class Plate(Module):
     """Free parameters of a see-through-screen camera; lengths in mm, the angle in rad.
 
@@ -68,22 +54,18 @@ class Plate(Module):
     """
 
     glass_thickness: Float[Array, ""] = eqx.field(
-        default=5.0, converter=quantity("mm", check=_length)
+        default=5.0, converter=quantity("mm", positive=True)
     )
-    reference_angle: Float[Array, ""] = eqx.field(
-        default=61.2 * deg, converter=quantity("rad", check=_number)
-    )
+    reference_angle: Float[Array, ""] = eqx.field(default=61.2 * deg, converter=quantity("rad"))
     film_thickness: Float[Array, ""] = eqx.field(
-        default=16 * um, converter=quantity("mm", check=_length)
+        default=16 * um, converter=quantity("mm", positive=True)
     )
-    index_modulation: Float[Array, ""] = eqx.field(
-        default=0.02, converter=quantity(check=_modulation)
-    )
+    index_modulation: Float[Array, ""] = eqx.field(default=0.02, converter=quantity(positive=True))
     lens_distance: Float[Array, ""] = eqx.field(
-        default=10.0, converter=quantity("mm", check=_length)
+        default=10.0, converter=quantity("mm", positive=True)
     )
     focal_distance: Float[Array, ""] = eqx.field(
-        default=6.0, converter=quantity("mm", check=_length)
+        default=6.0, converter=quantity("mm", positive=True)
     )
 
     def camera(

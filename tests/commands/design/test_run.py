@@ -193,8 +193,7 @@ def test_fronts_are_written_and_reported(whole, tmp_path):
     costs = ["thickness 2 mm", "thickness 3 mm", "thickness 2 mm", "thickness 3 mm"]
     captures = ["2 captures", "4 captures"]
     simulated = [f"{text}, simulated" for text in captures]
-    steps = list(told)
-    assert steps[steps.index(costs[0]) :] == [*costs, *captures, *simulated, "report"]
+    assert list(told)[7:] == [*costs, *captures, *simulated, "report"]
     path = folder.path
     assert stored(path) == design
     thin, thick = design.pareto.thickness.points
