@@ -1,7 +1,7 @@
 """Public calls against the compiled programs inside them: what checks and conversions cost.
 
 Both sides take turns in one run, warmed up and waited for, so that the machine's load is the same
-for both; the least of their times counts. What a solver prepares once is prepared for both.
+for both; the median of the turns' ratios counts. What a solver prepares once is prepared for both.
 """
 
 import time
@@ -23,8 +23,8 @@ from thincam_jax.reconstruction.ridge import ridge_by_modes
 from thincam_jax.reconstruction.splittings import admm_method
 
 ROUNDS, SHAPE = 20, (240, 320)
-# A FlatCam's captures are read three times more, for the mean image, its residual and objective.
-MOST = {"flatcam": 2.0, "psf": 1.5, "capture": 1.2, "ridge": 1.3, "admm": 1.5}
+# 1.5 is aimed at: two slow cores had 1.42 to 1.57 for a FlatCam and 1.36 to 1.64 for a PSF.
+MOST = {"flatcam": 1.7, "modes": 2.2, "psf": 1.7, "capture": 1.2, "ridge": 1.3, "admm": 1.5}
 LIGHT, FAR = jnp.float32(500e-6), jnp.float32(250.0)
 
 
@@ -38,16 +38,34 @@ def camera():
     return tc.LenslessCamera(mask, tc.Sensor((1024, 1024), single(5.5e-3)), single(6.5))
 
 
-def flatcam():
+def colour_capture():
     left, right = codes()
     rng = np.random.default_rng(0)
     captures = left @ rng.uniform(size=(CHANNELS, *FIELD)) @ right.T
     captures += 0.01 * captures.std() * rng.normal(size=captures.shape)
-    operator, seen = Separable(single(left), single(right)).with_modes(), single(captures)
-    recording, solver, rho = tc.Recording(seen, operator, noise_variance=1.0), tc.Ridge(RHO), RHO
+    operator = Separable(single(left), single(right)).with_modes()
+    return tc.Recording(single(captures), operator, noise_variance=1.0), tc.Ridge(RHO)
+
+
+def flatcam():
+    recording, solver = colour_capture()
+    public, inside = ridge_sides(recording, solver)
+    problem = recording.problem()
+    return public, lambda: (ridge_module._uniform(problem), inside())
+
+
+def modes():
+    """Beside the closed form alone, of mean 0 and without objective.
+
+    `reconstruct` reads the captures three times more: for the uniform image, for what is left
+    without it and for the objective. Subtracted from the modes instead of the captures, that image
+    costs single precision a digit: see tests/reconstruction/test_ridge.py.
+    """
+    recording, solver = colour_capture()
+    seen, operator = recording.captures[0], recording.imaging_model.operators[0]
     return (
         lambda: tc.reconstruct(recording, solver).image,
-        lambda: ridge_by_modes(operator.modes, seen, rho),
+        lambda: ridge_by_modes(operator.modes, seen, RHO),
     )
 
 
@@ -88,7 +106,10 @@ def convolution():
 
 
 def ridge():
-    recording, solver = convolution(), tc.Ridge(iterations=20)
+    return ridge_sides(convolution(), tc.Ridge(iterations=20))
+
+
+def ridge_sides(recording, solver):
     problem, _, mean, _, rho = solver._posed(recording)
     inside = problem, single(rho), mean, single(solver.tolerance), solver.iterations
     return lambda: tc.reconstruct(recording, solver).image, lambda: ridge_module._solve(*inside)
@@ -104,7 +125,9 @@ def admm():
     )
 
 
-@pytest.mark.parametrize("sides", [flatcam, psf, capture, ridge, admm], ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "sides", [flatcam, modes, psf, capture, ridge, admm], ids=lambda f: f.__name__
+)
 def test_public_call_against_inner_program(sides, capsys):
     with jax.enable_x64(False):
         both = sides()
@@ -120,4 +143,4 @@ def test_public_call_against_inner_program(sides, capsys):
     with capsys.disabled():
         print(f"\n{sides.__name__:8s} {public:7.2f} ms, inside {inner:7.2f} ms: ", end="")
         print(f"{public / inner:.2f} times; of turns {middle:.2f} ({low:.2f} to {high:.2f})")
-    assert public < MOST[sides.__name__] * inner
+    assert middle < MOST[sides.__name__]

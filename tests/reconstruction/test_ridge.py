@@ -266,6 +266,23 @@ def test_ridge_by_modes_is_the_dense_solution():
     assert float(jax.grad(length)(at)) == pytest.approx(float(change), rel=1e-6)
 
 
+def test_float32_keeps_its_digits_under_bright_light():
+    """The uniform light is subtracted from captures; subtracted from modes it costs a digit."""
+    chance = np.random.default_rng(5)
+    sizes = zip((150, 180), FLAT_FIELD, strict=True)
+    left, right = (chance.integers(0, 2, size).astype(float) for size in sizes)
+    truth = 1 + 0.01 * chance.uniform(-1, 1, FLAT_FIELD)
+    seen, images = left @ truth @ right.T, {}
+    for dtype in (np.float32, np.float64):
+        camera = Separable(left.astype(dtype), right.astype(dtype)).with_modes()
+        # The same numbers for both: the captures' own rounding is none of the solver's.
+        given = seen.astype(np.float32).astype(dtype)
+        recording = tc.Recording(given, camera, noise_variance=1e-4)
+        images[dtype] = np.asarray(tc.reconstruct(recording, tc.Ridge(1.0)).image, np.float64)
+    error = np.abs(images[np.float32] - images[np.float64]).max()
+    assert error < 4e-5 * truth.std(), error / truth.std()
+
+
 @pytest.mark.parametrize("terms", quick([1, 3], 0))
 def test_ridge_takes_the_modes_that_are_kept(terms):
     """The same image as without, and as of the whole matrix."""

@@ -109,7 +109,10 @@ def as_array(value: Any, *, floating: bool = False) -> Array:
     `jnp.asarray` would compile a program for each shape of a NumPy array, and give a plain number a
     weak type, for which programs are compiled once more.
     """
-    if not isinstance(value, jax.Array) and not any(map(is_traced, jax.tree.leaves(value))):
+    if isinstance(value, jax.Array):
+        if not value.weak_type and not (floating and value.dtype.kind in "iub"):
+            return value
+    elif not any(map(is_traced, jax.tree.leaves(value))):
         known = np.asarray(value)
         if floating and known.dtype.kind in "iub":
             known = known.astype(float)

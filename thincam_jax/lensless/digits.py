@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
@@ -41,8 +42,8 @@ def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bo
 def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
     """Largest phase, rad, of the orders' fringes where they are strong and light falls."""
     with jax.ensure_compile_time_eval():  # inside jit, sums of known numbers are traced as well
-        scale = float(path.magnification)
-        epsilon = float(path.epsilon(mask.beta)) if model != "geometric" else 0.0
+        scale, epsilon = map(float, _scale_and_epsilon(path, mask.beta))
+    epsilon = 0.0 if model == "geometric" else epsilon
     beta, halves = float(mask.beta), [float(side) / 2 for side in mask.extent]
     ends = [
         (n - 1) / 2 * float(grid.pitch) / scale + abs(float(c))
@@ -58,3 +59,8 @@ def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
         reach = (min(end, gain_of_reach * half) for end, half in zip(ends, halves, strict=True))
         found = max(found, abs(k) * beta / gain * sum(r**2 for r in reach))
     return found
+
+
+@jax.jit
+def _scale_and_epsilon(path: Path, beta: Float[Array, ""]):
+    return path.magnification, path.epsilon(beta)
