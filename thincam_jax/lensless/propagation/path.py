@@ -2,6 +2,7 @@
 
 import functools
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,6 +38,8 @@ class Path(Module):
     - `distance`: d, mm, > 0.
     - `object_distance`: t, mm, > 0; infinity is a plane wave.
     - `at`: (y, x) of the point, mm; of a plane wave, the tangents of its angles. None on the axis.
+    - `sine`: of a path along one axis, see `along_axes`: of the ray's angle in the plane of that
+      axis; None where the ray is the axis.
     - `skew`: whether the point is, or may be, off both of the mask's axes.
     - `follows`: whether the middle of the sensor's samples is where the ray through the mask's
       plane at (0, 0) meets it, in place of the axis.
@@ -50,6 +53,7 @@ class Path(Module):
     at: Float[Array, "2"] | None = eqx.field(
         default=None, converter=quantity("mm", shape=(2,), optional=True)
     )
+    sine: Float[Array, ""] | None = None
     skew: bool = eqx.field(default=False, static=True)
     follows: bool = eqx.field(default=False, static=True)
 
@@ -66,6 +70,24 @@ class Path(Module):
     def epsilon(self, beta: Float[Array, ""]) -> Float[Array, ""]:
         """ε = βλd/(πM), the strength of diffraction; at ε = 1 order −1 focuses on the sensor."""
         return beta * self.wavelength * self.distance / (jnp.pi * self.magnification)
+
+    def detour(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
+        r"""The distance from a point of the mask, to second order, at which the wave turns as at u.
+
+        A sphere about a point at L = dc²/M along an oblique path of d/c³ reaches u with the phase
+        of :math:`b w^2`,
+
+        .. math:: w^2 = \frac{2L\,u^2}{\sqrt{L^2 + 2Lsu + u^2} + L + su}
+
+        exactly in the plane of incidence. Written so that nothing cancels, and over its value for
+        s = 0: what second order leaves out on the axis, it leaves out here. To third order
+        :math:`w^2 = u^2 (1 - su/L)`.
+        """
+        if self.sine is None:
+            return u
+        length = self.distance * (1 - self.sine**2) / self.magnification
+        ray, axis = jnp.sqrt(length**2 + 2 * length * self.sine * u + u**2), jnp.hypot(length, u)
+        return u * jnp.sqrt((axis + length) / (ray + length + self.sine * u))
 
     def on_mask(
         self, grid: Grid, centre: Float[Array, "2"]
@@ -102,10 +124,16 @@ class Path(Module):
             return self, self
         infinite = jnp.isinf(self.object_distance)
         near = jnp.where(infinite, 1.0, self.object_distance)
-        stretched = ((1 + (s / ray.cosine) ** 2) / ray.cosine for s in (ray.down, ray.across))
+        stretched = ((s, (1 + (s / ray.cosine) ** 2) / ray.cosine) for s in (ray.down, ray.across))
         down, across = (
-            Path(self.wavelength, self.distance * n, jnp.where(infinite, jnp.inf, near * n))
-            for n in stretched
+            replace(
+                self,
+                distance=self.distance * n,
+                object_distance=jnp.where(infinite, jnp.inf, near * n),
+                at=None,
+                sine=sine,
+            )
+            for sine, n in stretched
         )
         return down, across
 

@@ -77,7 +77,7 @@ def cell_shadows(
     edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
 ) -> tuple[Complex[Array, "cell n"], Complex[Array, "edge n"]]:
     """Of constant cells: where each is lit, and the wave of each edge (`edge_wave`)."""
-    offset = edges[:, None] - x
+    offset = -path.detour(x - edges[:, None])
     lit = (offset[:-1] < 0) & (offset[1:] >= 0)  # as the waves' own steps have it
     return as_complex(lit.astype(x.dtype)), edge_wave(path.fresnel_curvature, offset)
 
