@@ -130,3 +130,14 @@ for ax, name in ((first, "mean |H|/√H(0) (mm)"), (second, "its slope")):
     ax.set(xlabel="width of a slit (µm)", ylabel=name)
 figure.savefig(FIGURES / "best_slit.png")
 assert signal(best) >= 0.999 * signals.max()
+
+# %%
+# Have it made
+# ------------
+#
+# A layout in GDSII is what a mask shop takes (`pip install 'thincam_jax[layout]'`). Parts finer
+# than its lithography writes are refused.
+
+drawn = GolombSlits(best, 48 * um)
+layout = tc.design.write_gds(FIGURES / "golomb.gds", drawn, smallest_feature=2 * um)
+assert layout.stat().st_size > 0

@@ -110,7 +110,16 @@ def test_help_is_a_page_of_names():
 @pytest.mark.thorough
 def test_the_core_runs_without_any_extra(tmp_path):
     """A study from a file to its report, a TIFF, and the line that names the extra for another."""
-    extras = ("anywidget", "dask", "distributed", "imagecodecs", "pyarrow", "rawpy", "serial")
+    extras = (
+        "anywidget",
+        "dask",
+        "distributed",
+        "gdstk",
+        "imagecodecs",
+        "pyarrow",
+        "rawpy",
+        "serial",
+    )
     extras += ("starlette", "usb", "uvicorn", "zarr")
     file, tiff = tiny.write(tmp_path), tmp_path / "a.tif"
     tifffile.imwrite(tiff, np.ones((6, 8), np.uint8), compression="lzw")

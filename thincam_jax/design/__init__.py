@@ -16,6 +16,7 @@ from thincam_jax.design.fronts import non_dominated as non_dominated
 from thincam_jax.design.landscape import Landscape as Landscape
 from thincam_jax.design.landscape import evaluate_grid as evaluate_grid
 from thincam_jax.design.landscape import landscape_around as landscape_around
+from thincam_jax.design.layout import write_gds as write_gds
 from thincam_jax.design.match import Match as Match
 from thincam_jax.design.match import MatchSettings as MatchSettings
 from thincam_jax.design.match import ResponseModel as ResponseModel
