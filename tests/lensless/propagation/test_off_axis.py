@@ -98,10 +98,11 @@ def test_closed_form_against_the_direct_sum(angle, azimuth, distance, every):
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("azimuth", [0, 30, 45])
 @pytest.mark.parametrize(("angle", "most"), [(20, 0.005), (30, 0.01)])
-def test_averages_over_pixels_are_within_a_percent(angle, most):
+def test_averages_over_pixels_are_within_a_percent(angle, most, azimuth):
     """β = 25 rad/mm², d = 6.5 mm, against the angular spectrum; the axis' PSF is 4 and 11 % off."""
-    tangent = tangents(angle, 0)
+    tangent = tangents(angle, azimuth)
     sensor, light = tc.Sensor((64, 96), 22 * um), {"wavelength": 500 * nm, "at": tangent}
 
     def camera(centre):
@@ -198,6 +199,26 @@ def test_on_the_axis_it_is_the_psf_of_the_axis(distance):
     for at in ((0.0, 0.0), (0.0, 1e-9), (1e-9, 1e-9)):
         assert relative(anywhere(jnp.asarray(at), distance), expected) < 1e-6
     assert relative(psf((0.0, 0.0), object_distance=distance), expected) < 1e-12
+
+
+def test_cells_are_continuous_at_the_axis_and_have_slopes():
+    """Against a difference, of a point along the axis that is traced."""
+    camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
+    weights = np.random.default_rng(0).normal(size=SENSOR.shape)
+
+    @jax.jit
+    def value(x):
+        return jnp.sum(weights * tc.psf(camera, wavelength=500 * nm, at=(0.0, x)))
+
+    on_axis = float(jnp.sum(weights * tc.psf(camera, wavelength=500 * nm)))
+    assert float(value(1e-9)) == pytest.approx(on_axis, rel=1e-6)
+    difference = (value(0.2 + 1e-6) - value(0.2 - 1e-6)) / 2e-6
+    assert float(jax.grad(value)(0.2)) == pytest.approx(float(difference), rel=1e-5)
+
+
+def test_a_point_behind_the_mask_is_refused():
+    with pytest.raises(ValueError, match="object_distance = -10"):
+        tc.psf(camera_of(), wavelength=500 * nm, object_distance=-10.0, at=(0.0, 1.0))
 
 
 def test_along_an_axis_both_forms_agree():
