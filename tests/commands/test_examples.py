@@ -3,6 +3,7 @@
 import re
 import tomllib
 from pathlib import Path
+from urllib.parse import unquote, urljoin, urlsplit
 
 import pytest
 from commands.test_cli import call, one_line
@@ -32,10 +33,21 @@ def test_every_shipped_file_is_one(tmp_path):
 
 
 def without_name(path):
-    """A file whose name is that of its experiment, which names its run folder, too."""
-    text = path.read_text("utf-8")
+    """A file whose name is that of its experiment, which names its run folder, too.
+
+    Its first line leads an editor to the schema that lies with the shipped files, from anywhere.
+    """
+    header, text = path.read_text("utf-8").split("\n", 1)
+    place = header.removeprefix("# yaml-language-server: $schema=")
+    schema = urlsplit(urljoin(path.as_uri(), place)).path
+    assert Path(unquote(schema)) == ROOT / f"configs/schemas/{kind_name(path)}.json"
     assert f"\nname: {path.stem}\n" in text
     return text.replace(f"\nname: {path.stem}\n", "")
+
+
+def kind_name(path):
+    """The name of a file's kind."""
+    return next(name for name, kind in kinds.KINDS.items() if kind is kinds.read_kind(path))
 
 
 @pytest.mark.parametrize("name", ["true", "a b", "ε: #1"])

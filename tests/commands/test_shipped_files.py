@@ -3,15 +3,18 @@
 import json
 import re
 
+import check_jsonschema
 import pytest
 import yaml
+from click.testing import CliRunner
 from commands.test_cli import call, one_line
 from jsonschema import Draft202012Validator
 
-from helpers import ROOT
-from thincam_jax.commands.kinds import load_experiment, read_kind
+from helpers import ROOT, quick
+from thincam_jax.commands.kinds import KINDS, load_experiment, read_kind
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
+SCHEMAS = ROOT / "configs/schemas"
 # Of each file, without its texts for readers; a changed default or reading of a unit shows.
 RESOLVED = json.loads((ROOT / "tests/commands/resolved.json").read_text("utf-8"))
 
@@ -32,10 +35,7 @@ def test_every_file_is_recorded():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_schema_takes_it_and_no_number_without_its_unit(path):
     raw = yaml.safe_load(path.read_text("utf-8"))
-    result = call("schema", raw.get("kind", "study"))
-    assert result.exit_code == 0, result.output
-    schema = json.loads(result.stdout)
-    Draft202012Validator.check_schema(schema)
+    schema = json.loads((SCHEMAS / f"{raw.get('kind', 'study')}.json").read_text("utf-8"))
     validator = Draft202012Validator(schema)
     assert [error.message for error in validator.iter_errors(raw)] == []
     for entries, key in with_units(raw):
@@ -43,6 +43,34 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
         assert not validator.is_valid(raw), f"{key} without its unit"
         entries[key] = given
     assert not validator.is_valid(raw | {"colour": 1})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_schemas_of_the_shipped_files_are_those_of_the_command(kind):
+    """Refreshed by `thincam schema KIND > configs/schemas/KIND.json`."""
+    result = call("schema", kind)
+    assert result.exit_code == 0, result.output
+    assert (SCHEMAS / f"{kind}.json").read_text("utf-8") == result.stdout
+    Draft202012Validator.check_schema(json.loads(result.stdout))
+
+
+@pytest.mark.parametrize("kind", quick(KINDS, 0))
+def test_check_of_an_editor(kind, tmp_path):
+    """It accepts the shipped files of a kind and refuses a bare number."""
+    files = [path for path in FILES if read_kind(path) is KINDS[kind]]
+    text = files[0].read_text("utf-8")
+    bare = tmp_path / "bare.yaml"
+    bare.write_text(re.sub(r": (\d+) (um|mm|nm)\b", r": \1", text, count=1), "utf-8")
+
+    def check(*paths):
+        options = ["--schemafile", SCHEMAS / f"{kind}.json", *paths]
+        return CliRunner().invoke(check_jsonschema.main, [str(option) for option in options])
+
+    accepted, refused = check(*files), check(bare)
+    assert accepted.exit_code == 0, accepted.output
+    if kind == "denoiser":  # none of whose numbers has a unit
+        return
+    assert refused.exit_code == 1 and "is not of type 'string'" in refused.output
 
 
 DESIGNS = [path.stem for path in FILES if path.stem.startswith("design")]

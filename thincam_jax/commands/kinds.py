@@ -162,6 +162,8 @@ def init(
         path = path / f"{kind}.yaml" if path.is_dir() else path
         source = _source(kind)
         text, command = source.read_text(encoding="utf-8"), read_kind(source).command
+        # A copy may lie anywhere; its schema stays with the package that reads it.
+        text = text.replace("$schema=", f"$schema={_folder().as_uri()}/", 1)
         # One name for the file, the experiment and its run folder.
         name = yaml.safe_dump(re.sub(r"[^\w .,()=+-]", "_", path.stem), allow_unicode=True)
         text = re.sub("^name: .*$", f"name: {name.split(chr(10))[0]}", text, count=1, flags=re.M)
