@@ -12,7 +12,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import FieldError, unchecked
+from thincam_jax._core.quantity import FieldError, quantity, unchecked
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.exposures import Exposures
@@ -51,7 +51,9 @@ class Design(Module):
     beta: Float[Array, " capture"] = eqx.field(converter=unchecked("rad/mm^2"))
     phase: Float[Array, " capture"] = eqx.field(converter=unchecked("rad"))
     distance: Float[Array, " capture"] = eqx.field(converter=unchecked("mm"))
-    wavelength: Float[Array, " capture"] = eqx.field(converter=unchecked("mm"))
+    wavelength: Float[Array, " capture"] = eqx.field(
+        converter=quantity("mm", check=checks.wavelengths)
+    )
     exposure: Float[Array, " capture"] = eqx.field(converter=unchecked("shares"))
     width: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
     profile: Profile = eqx.field(static=True)

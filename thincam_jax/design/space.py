@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.quantity import FieldError, quantities, quantity, whole
+from thincam_jax._core.quantity import FieldError, Quantity, quantities, quantity, whole
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
 _WITHIN = 1e-3  # distance in the cube below which a limit is active
@@ -25,15 +25,31 @@ QUANTITIES = quantities(Design)  # what may be free
 
 @dataclass(frozen=True)
 class ReportedNumber:
-    """Format in which a number of a shot is reported.
+    """Format in which a number of a shot is reported, in the unit of its field; light in nm.
 
-    - `name`, `unit`: in tables and on axes; `scale`: from the package's unit; `form`: its digits.
+    - `name`: in tables and on axes.
     """
 
     name: str
-    unit: str = ""
-    scale: float = 1.0
-    form: str = ".2f"
+    quantity: Quantity
+
+    @property
+    def _light(self) -> bool:
+        return self.quantity.kind == "wavelength"
+
+    @property
+    def unit(self) -> str:
+        return "nm" if self._light else self.quantity.symbol
+
+    @property
+    def scale(self) -> float:
+        """Factor from the package's unit."""
+        return 1e6 if self._light else 1.0
+
+    @property
+    def form(self) -> str:
+        """Format of its digits."""
+        return ".0f" if self._light else ".2f"
 
     @property
     def label(self) -> str:
@@ -49,14 +65,8 @@ class ReportedNumber:
         return f"{self.name} of {word} {', '.join(str(s) for s in shots)}{unit}"
 
 
-REPORTED = {
-    "beta": ReportedNumber("β", "rad/mm²"),
-    "phase": ReportedNumber("phase", "rad"),
-    "distance": ReportedNumber("distance", "mm"),
-    "wavelength": ReportedNumber("wavelength", "nm", 1e6, ".0f"),
-    "width": ReportedNumber("mask width", "mm"),
-    "exposure": ReportedNumber("exposure"),
-}
+_NAMES = {"beta": "β", "width": "mask width"}  # of those reported by another name
+REPORTED = {name: ReportedNumber(_NAMES.get(name, name), one) for name, one in QUANTITIES.items()}
 
 
 @checked

@@ -29,7 +29,7 @@ from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Scaled, Sparse
 from thincam_jax.measured import calibration as measuring
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, Order
-from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
+from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS, QUANTITIES
 from thincam_jax.studies.evaluate import rounded
 from thincam_jax.studies.pictures import (
     Reconstructed,
@@ -325,7 +325,7 @@ class CalibrationRun:
         errors = self.fit.standard_errors
         values = {
             name: FittedValue(
-                float(value), float(errors[name]), true.get(name), PARAMETERS[name][0].unit
+                float(value), float(errors[name]), true.get(name), QUANTITIES[name].unit
             )
             for name, value in self.fit.values.items()
             if name != "gain"

@@ -19,14 +19,16 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
-from thincam_jax._core.quantity import unchecked
+from thincam_jax._core.quantity import quantities, unchecked
 from thincam_jax.imaging.operators import Matrix, Scaled
 from thincam_jax.imaging.refractive_index import changed
 from thincam_jax.measured.calibration.problem import Status, covariance, hardly_seen, verdict
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import (
     ObjectPlane,
+    Screen,
     SeeThroughCamera,
+    VolumeHologram,
     pixel_centres,
     system_operator,
     trace,
@@ -34,24 +36,42 @@ from thincam_jax.waveguide import (
 )
 from thincam_jax.waveguide.system import seen_size
 
-# Parameters that can be fitted, with unit and a step of small effect on an image.
+# Parameters that can be fitted, with a step of small effect on an image.
 PARAMETERS = {
-    "glass_thickness": (unchecked("mm"), 0.01),
-    "lens_distance": (unchecked("mm"), 0.1),
-    "focal_distance": (unchecked("mm"), 0.001),
-    "index": (unchecked(), 1e-3),
-    "slant": (unchecked("rad"), 1e-3),
-    "tilt": (unchecked("rad"), 1e-3),
-    "plate_x": (unchecked("rad"), 1e-3),
-    "plate_y": (unchecked("rad"), 1e-3),
-    "shrinkage": (unchecked(), 1e-3),
-    "film_thickness": (unchecked("mm"), 1e-4),
-    "index_modulation": (unchecked(), 1e-4),
-    "object_distance": (unchecked("mm"), 1.0),
-    "object_x": (unchecked("mm"), 0.1),
-    "object_y": (unchecked("mm"), 0.1),
+    "glass_thickness": 0.01,
+    "lens_distance": 0.1,
+    "focal_distance": 0.001,
+    "index": 1e-3,
+    "slant": 1e-3,
+    "tilt": 1e-3,
+    "plate_x": 1e-3,
+    "plate_y": 1e-3,
+    "shrinkage": 1e-3,
+    "film_thickness": 1e-4,
+    "index_modulation": 1e-4,
+    "object_distance": 1.0,
+    "object_x": 0.1,
+    "object_y": 0.1,
 }
-_QUANTITIES = {name: unit for name, (unit, _) in PARAMETERS.items()}
+# Place in a state of the value to which a step is added, and its entry in a vector.
+_PLACES = {
+    "glass_thickness": ("camera.screen.glass_thickness", ...),
+    "lens_distance": ("camera.lens_distance", ...),
+    "focal_distance": ("camera.focal_distance", ...),
+    "plate_x": ("camera.tilt", 0),
+    "plate_y": ("camera.tilt", 1),
+    "film_thickness": ("camera.screen.hologram.thickness", ...),
+    "index_modulation": ("camera.screen.hologram.index_modulation", ...),
+    "object_distance": ("plane.distance", ...),
+    "object_x": ("plane.centre", 0),
+    "object_y": ("plane.centre", 1),
+    "gain": ("gain", ...),
+}
+_FIELDS = quantities(VolumeHologram, Screen, SeeThroughCamera, ObjectPlane)
+_OF_PLACES = {name: place.rpartition(".")[2] for name, (place, _) in _PLACES.items()}
+_OF_PLACES["slant"] = "tilt"
+# Of the fields that the parameters are; those of a ratio have no unit.
+QUANTITIES = {name: _FIELDS.get(_OF_PLACES.get(name, name), unchecked()) for name in PARAMETERS}
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
@@ -104,8 +124,8 @@ class ScreenFit(Module):
     camera: SeeThroughCamera
     plane: ObjectPlane
     gain: Float[Array, ""]
-    values: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=_QUANTITIES))
-    standard_errors: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=_QUANTITIES))
+    values: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=QUANTITIES))
+    standard_errors: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=QUANTITIES))
     correlation: Float[Array, "unknown unknown"]
     explained: Float[Array, ""]
     status: Status = eqx.field(static=True)
@@ -116,22 +136,6 @@ class ScreenFit(Module):
     def system(self, plane: ObjectPlane) -> Scaled:
         """Matrix for an object at another distance, in the unit of the measured one."""
         return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
-
-
-# Place in a state of the value to which a step is added, and its entry in a vector.
-_PLACES = {
-    "glass_thickness": ("camera.screen.glass_thickness", ...),
-    "lens_distance": ("camera.lens_distance", ...),
-    "focal_distance": ("camera.focal_distance", ...),
-    "plate_x": ("camera.tilt", 0),
-    "plate_y": ("camera.tilt", 1),
-    "film_thickness": ("camera.screen.hologram.thickness", ...),
-    "index_modulation": ("camera.screen.hologram.index_modulation", ...),
-    "object_distance": ("plane.distance", ...),
-    "object_x": ("plane.centre", 0),
-    "object_y": ("plane.centre", 1),
-    "gain": ("gain", ...),
-}
 
 
 class _State(eqx.Module):
@@ -384,7 +388,7 @@ def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
 
 def _scaled(problem: _Problem) -> _Problem:
     """Problem whose unit steps each change the residual by a tenth of the data's norm."""
-    units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in problem.names])
+    units = jnp.asarray([PARAMETERS.get(n, 1.0) for n in problem.names])
     lengths = jnp.linalg.norm(_jacobian(replace(problem, unit=units)), axis=0)
     size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
     return replace(problem, unit=units * size / jnp.where(lengths > 0, lengths, size))
