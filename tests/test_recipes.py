@@ -1,12 +1,18 @@
 """The recipes of CONTRIBUTING.md, followed; that of a device in tests/commands/capture."""
 
+import re
+import sys
+from types import ModuleType
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
+from commands.test_cli import call, one_line
 
 import thincam_jax as tc
 from helpers import finite_difference, recipe, relative_l2
+from thincam_jax.commands.kinds import KINDS
 from thincam_jax.units import nm, um
 
 LIGHT = {"wavelength": 550 * nm, "pixel_integration": True}
@@ -17,6 +23,36 @@ def followed(name):
     defined = {"__name__": name}
     exec(recipe(name), defined)
     return defined
+
+
+CONTRAST = """
+name: seen
+kind: contrast
+wavelength: 500 nm
+mask: {beta: 100 rad/mm^2, width: 0.7 mm}
+distance: 5 mm
+sensor: {shape: [24, 40], pitch: 22 um}
+object: {distance: 250 mm, width: 40 mm}
+targets: [{name: chart, kind: usaf1951, pixels: 32}, {name: star, kind: siemens_star, pixels: 32}]
+"""
+
+
+def test_a_kind_of_experiment_is_run_explained_and_checked(tmp_path, monkeypatch):
+    module = ModuleType("thincam_jax.commands.contrast")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(KINDS, "contrast", None)
+    exec(recipe("a kind of experiment file"), module.__dict__)
+    path, out = tmp_path / "seen.yaml", tmp_path / "out"
+    path.write_text(CONTRAST, "utf-8")
+    shown = call("run", path, "--out", out)
+    assert shown.exit_code == 0, shown.output
+    assert re.search(r"chart\W+0\.\d{3}\W+star\W+0\.\d{3}", shown.stdout)
+    assert (out / "report.html").exists() and (out / "metrics.json").exists()
+    said = call("explain", path).stdout
+    assert "mask.width: 0.7 mm" in said and "2 captures of (24, 40) pixels" in said
+    assert '"contrast"' in call("schema", "contrast").stdout
+    path.write_text(CONTRAST.replace("distance: 5 mm", "distance: 5"), "utf-8")
+    assert one_line(call("run", path)).startswith(f"{path}:6: distance: 5 has no unit")
 
 
 def double_slit(width):

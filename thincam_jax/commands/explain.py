@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.kinds import KINDS, load_experiment
+from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment
 from thincam_jax.commands.terminal import ConfigFile, Overrides, say, say_result, told
 
 
@@ -25,9 +25,8 @@ def schema(
 
         if kind not in KINDS:
             raise ConfigError(f"kind: {kind!r} is unknown; choose one of {', '.join(KINDS)}")
-        sections = KINDS[kind].part(KINDS[kind].section)
-        text = json.dumps(sections.model_json_schema(), indent=2, ensure_ascii=False)
-    say(text)
+        form = KINDS[kind].part(KINDS[kind].section).model_json_schema()
+    say(json.dumps(form, indent=2, ensure_ascii=False))
 
 
 def explain(config: ConfigFile, set_: Overrides = None) -> None:
@@ -62,15 +61,12 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
     """Values by location; a list of values is one."""
     inner = data.items() if isinstance(data, dict) else enumerate(data)
     for key, value in inner:
-        deep = isinstance(value, dict) or (
-            isinstance(value, list) and any(isinstance(one, (dict, list)) for one in value)
-        )
-        if deep:
+        inside = value if isinstance(value, list) else ()
+        if isinstance(value, dict) or any(isinstance(one, (dict, list)) for one in inside):
             yield from _entries(value, (*location, key))
-        elif isinstance(value, list):
-            yield (*location, key), f"[{', '.join(map(str, value))}]"
         else:
-            yield (*location, key), str(value)
+            text = f"[{', '.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            yield (*location, key), text
 
 
 def dry_run(asked: Any, writes: str, setup: Any = None) -> None:
@@ -87,13 +83,13 @@ def dry_run(asked: Any, writes: str, setup: Any = None) -> None:
 
 
 def costs(asked: Any, setup: Any = None) -> Iterator[str]:
-    """What a file's run computes, in numbers; `setup`: what its kind builds, where it is built."""
-    own = {"screen": _rays, "design": _search, "capture": _frames}
-    training = {"learned": _lessons, "denoiser": _lessons}
-    return (own | training).get(getattr(asked, "kind", "study"), _study)(asked, setup)
+    """Work of a file's run, in numbers; `setup`: objects built of it, where they are."""
+    kind = kind_of(asked)
+    return kind.part(kind.costs)(asked, setup)
 
 
-def _study(asked: Any, setup: Any) -> Iterator[str]:
+def psfs(asked: Any, setup: Any) -> Iterator[str]:
+    """Of a study: its PSFs."""
     from thincam_jax.commands.study.build import assemble
 
     study = assemble(asked) if setup is None else getattr(setup, "study", setup)
@@ -120,7 +116,7 @@ def _psfs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[st
         )
 
 
-def _rays(asked: Any, setup: Any) -> Iterator[str]:
+def rays(asked: Any, setup: Any) -> Iterator[str]:
     """Of a see-through camera: rays, and entries of its matrix."""
     from thincam_jax._core.memory import readable
     from thincam_jax.commands.screen.run import build_cameras, build_plane
@@ -129,38 +125,38 @@ def _rays(asked: Any, setup: Any) -> Iterator[str]:
     (rows, columns), parts = asked.sensor.shape, asked.band_samples or 1
     cameras = build_cameras(asked) if setup is None else setup.cameras
     plane = build_plane(asked) if setup is None else setup.plane
-    rays = rows * columns * asked.orders * parts * len(cameras)
-    entries = rays * entries_of_a_ray(cameras[0], plane)
+    traced = rows * columns * asked.orders * parts * len(cameras)
+    entries = traced * entries_of_a_ray(cameras[0], plane)
     yield (
         f"matrix of each model: {rows}×{columns} pixels, {asked.orders} orders, {parts} parts of "
-        f"the band: {rays / 1e6:.3g} million rays, at most {entries / 1e6:.3g} million entries, "
+        f"the band: {traced / 1e6:.3g} million rays, at most {entries / 1e6:.3g} million entries, "
         f"{readable(12 * entries)}"  # a number and two indices, four bytes each
     )
 
 
-def _search(asked: Any, setup: Any) -> Iterator[str]:
+def search(asked: Any, setup: Any) -> Iterator[str]:
     """Of a design: the PSFs of the design to beat, and the evaluations of the search."""
-    search, shots = asked.search, asked.reference.shots
+    asks, shots = asked.search, asked.reference.shots
     exposures = asked.design(asked.reference).exposures
     cameras = exposures.cameras(asked.sensor.build(), asked.mask.build(beta=1.0))
     words = (f"β {exposure.beta:g} rad/mm²" for exposure in exposures)
     found = list(zip(cameras, exposures, words, strict=True))
     yield from _psfs(asked, found, asked.object.distance)
-    finely = search.frequencies
-    most = search.samples + search.starts * search.steps
+    finely = asks.frequencies
+    most = asks.samples + asks.starts * asks.steps
     yield (
-        f"search: {search.samples} samples, {search.starts} descents of at most {search.steps} "
+        f"search: {asks.samples} samples, {asks.starts} descents of at most {asks.steps} "
         f"steps: at most {most} evaluations and their gradients at {finely.radii}×"
         f"{finely.directions} frequencies of {len(shots)} shots"
     )
-    count, again = len(asked.targets), asked.validation
+    again = asked.validation
     yield (
         f"validation: {again.best} found designs, the design to beat and {len(asked.compare)} "
-        f"others, on {count} targets, noise of {again.seeds} seeds"
+        f"others, on {len(asked.targets)} targets, noise of {again.seeds} seeds"
     )
 
 
-def _frames(asked: Any, setup: Any) -> Iterator[str]:
+def frames(asked: Any, setup: Any) -> Iterator[str]:
     """Of a capture: frames, and the time that they are exposed."""
     from thincam_jax.commands.capture.command import build_plan
 
@@ -169,7 +165,8 @@ def _frames(asked: Any, setup: Any) -> Iterator[str]:
     yield f"{len(plan.steps)} frames, exposed for {seconds:.3g} s in all"
 
 
-def _lessons(asked: Any, setup: Any) -> Iterator[str]:
+def lessons(asked: Any, setup: Any) -> Iterator[str]:
+    """Of a training: its steps and checks."""
     training = asked.training
     checks = training.steps // training.check_every
     yield (

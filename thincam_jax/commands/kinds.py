@@ -20,6 +20,7 @@ class Kind:
 
     - `noun`: what such a file is. `command`: of `thincam`, that takes it.
     - `section`: its configuration, as MODULE:NAME in `thincam_jax.commands`.
+    - `costs`: of a configuration and its objects, lines that say what its run computes.
     - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
     - `build`, `run`: of those for `thincam run`, what makes objects of the configuration, and what
       runs these into a folder; its result has a `table`. Of those for `thincam train`, what makes
@@ -29,12 +30,13 @@ class Kind:
     noun: str
     command: str
     section: str
+    costs: str
     example: str = ""
     build: str = ""
     run: str = ""
 
     def part(self, place: str) -> Any:
-        """What is at MODULE:NAME, imported when it is needed."""
+        """The object at MODULE:NAME, imported when it is needed."""
         module, name = place.split(":")
         return getattr(import_module(f"thincam_jax.commands.{module}"), name)
 
@@ -42,26 +44,30 @@ class Kind:
 # By the `kind` of their files; a study's file does not name it.
 KINDS = {
     "study": Kind(
-        *("a study", "run", "sections:StudyConfig", "quick"),
+        *("a study", "run", "sections:StudyConfig", "explain:psfs", "quick"),
         *("study.build:build_study", "study.run:run_study"),
     ),
     "refocus": Kind(
-        *("a refocusing", "run", "refocus:RefocusConfig", "fza_refocus"),
+        *("a refocusing", "run", "refocus:RefocusConfig", "explain:psfs", "fza_refocus"),
         *("refocus:build_refocus", "refocus:run_refocus"),
     ),
     "screen": Kind(
-        *("a see-through screen", "run", "screen.config:ScreenConfig", ""),
+        *("a see-through screen", "run", "screen.config:ScreenConfig", "explain:rays", ""),
         *("screen.run:build_screen", "screen.run:run_screen"),
     ),
-    "design": Kind("a design", "design", "design.config:DesignConfig", "design_distances"),
-    "capture": Kind("a capture", "capture", "capture.config:CaptureConfig", "rig_virtual"),
+    "design": Kind(
+        *("a design", "design", "design.config:DesignConfig", "explain:search", "design_distances")
+    ),
+    "capture": Kind(
+        *("a capture", "capture", "capture.config:CaptureConfig", "explain:frames", "rig_virtual")
+    ),
     "learned": Kind(
-        *("a network", "train", "learned.refocusing:LearnedConfig", "learned_refocus"),
-        *("learned.refocusing:build_lessons", "learned.refocusing:run_training"),
+        *("a network", "train", "learned.refocusing:LearnedConfig", "explain:lessons"),
+        *("learned_refocus", "learned.refocusing:build_lessons", "learned.refocusing:run_training"),
     ),
     "denoiser": Kind(
-        *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "denoiser"),
-        *("learned.denoiser:build_lessons", "learned.denoiser:run_denoiser"),
+        *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "explain:lessons"),
+        *("denoiser", "learned.denoiser:build_lessons", "learned.denoiser:run_denoiser"),
     ),
 }
 
@@ -128,7 +134,7 @@ def _folder() -> Path:
 
 
 def examples() -> list[str]:
-    """What `thincam init` can write."""
+    """Names that `thincam init` takes."""
     others = {path.stem for path in _folder().glob("*.yaml")} - set(_FILE_OF.values())
     return [*_FILE_OF, *sorted(others)]
 

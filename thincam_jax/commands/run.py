@@ -93,6 +93,7 @@ def design(
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):
+        from thincam_jax.commands import explain
         from thincam_jax.commands.design.build import build_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
         from thincam_jax.commands.kinds import load_experiment
@@ -102,8 +103,6 @@ def design(
         warn(study.warnings)
         folder = DesignFolder.chosen(out, wanted.name, wanted)
         if dry_run:
-            from thincam_jax.commands import explain
-
             explain.dry_run(wanted, folder.outcome(wanted))
             return
         with counted(wanted.name) as progress:

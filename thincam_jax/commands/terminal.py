@@ -1,4 +1,4 @@
-"""What the commands share: exit codes, how an error is told, and progress bars.
+"""Exit codes, messages of errors, and progress bars of all commands.
 
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
@@ -8,7 +8,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -37,10 +37,11 @@ DryRun = Annotated[
 
 @contextlib.contextmanager
 def told(interrupted: Callable[[], str]) -> Iterator[None]:
-    """What a user can put right is told in one line, and Ctrl-C by what `interrupted` says.
+    """Report user errors in one line, and Ctrl-C by the text that `interrupted` gives.
 
     Anything else is a defect and keeps its traceback. Python's warnings take a line each, too.
     """
+    from thincam_jax._core.files import MeasurementError
     from thincam_jax._core.jax_settings import cannot_start
     from thincam_jax.commands.config_file import ConfigError
 
@@ -54,9 +55,11 @@ def told(interrupted: Callable[[], str]) -> Iterator[None]:
         tell(interrupted())
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
-        if not isinstance(error, (ConfigError, OSError, MemoryError)) and not _no_memory(error):
+        mended = (ConfigError, MeasurementError, OSError, MemoryError)
+        if not isinstance(error, mended) and not _no_memory(error):
             raise
-        fail(error)
+        tell(in_a_line(error))
+        raise typer.Exit(WRONG_INPUT) from None
 
 
 def _no_memory(error: BaseException) -> bool:
@@ -73,7 +76,7 @@ def warn(texts: list[str]) -> None:
 
 
 def in_a_line(error: BaseException) -> str:
-    """What a user is told of an error; `name='value'`, an argument in Python, as an option."""
+    """Message of an error for users; `name='value'`, an argument in Python, as an option."""
     if _no_memory(error):
         return "out of memory; give fewer pixels (a larger --downsample or pitch) or close programs"
     return re.sub(r"`(\w+)(?:='(\w+)')?`", _as_option, str(error))
@@ -109,12 +112,6 @@ def tell(text: str) -> None:
     for line in lines:
         cut = line if len(line) <= 2 * _HALF else f"{line[:_HALF]} … {line[-_HALF:]}"
         errors.print(f"thincam: {cut}", highlight=False, markup=False, soft_wrap=True)
-
-
-def fail(error: BaseException) -> NoReturn:
-    """End for an error that a user can put right."""
-    tell(in_a_line(error))
-    raise typer.Exit(WRONG_INPUT)
 
 
 def show(table: "Table") -> None:

@@ -55,7 +55,7 @@ def capture(
         return f"{kept}; go on with: thincam capture {config} --out {store} --resume{typed}"
 
     with told(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
-        from thincam_jax._core.files import MeasurementError, write_whole
+        from thincam_jax._core.files import write_whole
         from thincam_jax.commands import explain
         from thincam_jax.commands.checked_config import dump_config
         from thincam_jax.commands.config_file import ConfigError, slug
@@ -94,8 +94,6 @@ def capture(
             if store.exists():
                 tell(go_on())
             raise typer.Exit(STOPPED) from None
-        except MeasurementError as error:
-            raise ConfigError(str(error)) from None
         write_whole(store / _CONFIG, dump_config(asked))
         write_whole(store / _SECONDS, to_json(outcome.seconds))
         warn([f"recovered from {text}" for text in outcome.recovered])
@@ -135,11 +133,10 @@ def preview(
 
 
 def reconstruct_store(store: Path, out: Path | None) -> Path:
-    """What `thincam run` does with a store; returns the folder of the report.
+    """Reconstruct a store of captures; returns the folder of the report.
 
-    **Errors**: ConfigError, one line, for a folder that is no complete store.
+    **Errors**: ConfigError or MeasurementError, one line, for a folder that is no complete store.
     """
-    from thincam_jax._core.files import MeasurementError
     from thincam_jax.commands.capture.config import CaptureConfig
     from thincam_jax.commands.capture.run import run_captures
     from thincam_jax.commands.checked_config import load_as
@@ -154,12 +151,9 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
         )
     config = load_as(CaptureConfig, store / _CONFIG)
     folder = RunFolder(out or Path("runs") / slug(config.name))
-    try:
-        taken = _taken(store, config)
-        with counted(config.name) as progress:
-            run_captures(config, taken, folder, progress)
-    except MeasurementError as error:
-        raise ConfigError(str(error)) from None
+    taken = _taken(store, config)
+    with counted(config.name) as progress:
+        run_captures(config, taken, folder, progress)
     return folder.path
 
 

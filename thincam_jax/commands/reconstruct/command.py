@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 from typer import Option
 
-from thincam_jax.commands.terminal import Overrides, fail, say_result, told
+from thincam_jax.commands.terminal import Overrides, say_result, told
 
 # What works from a measured PSF and prepared captures; "auto" then is admm-tv.
 METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
@@ -128,47 +128,44 @@ def reconstruct(
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
         from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
         from thincam_jax.commands.reconstruct.run import run_with_bar
-        from thincam_jax.measured import MeasurementError, Preparation
+        from thincam_jax.measured import Preparation
 
-        try:
-            given = psf, camera, set_, network, distance, background
-            known, focusing = options.known_psf(*given)
-            sources = Sources(
-                known,
-                options.read_background(background),
-                0.0 if camera else options.read_background(psf_background),
-                dead,
-                bits,
-                Preparation(
-                    bayer=bayer,
-                    demosaicing=demosaic,
-                    downsample=downsample,
-                    corner=options.read_corner(corner),
-                    psf_scale=psf_scale,
-                    crop=options.read_crop(crop),
-                    saturation=saturation,
-                    noise_threshold=noise_threshold,
-                    psf_channels=psf_channels,
-                ),
-                psf_bits,
-                options.read_distances(distances, psf),
-            )
-            recipe = Recipe(
-                method=method.replace("-", "_"),
-                tau=tau,
-                iterations=iterations,
-                coupling=coupling,
-                field=field,
-                flip=flip,
-                ridge=ridge,
-                noise=noise,
-                focusing=focusing,
-            )
-            balance, unsure = options.read_white_balance(white_balance), focusing is not None
-            output = Output(out, linear, gamma, balance, unsure)
-            end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
-        except (MeasurementError, OSError) as error:
-            fail(error)
+        given = psf, camera, set_, network, distance, background
+        known, focusing = options.known_psf(*given)
+        sources = Sources(
+            known,
+            options.read_background(background),
+            0.0 if camera else options.read_background(psf_background),
+            dead,
+            bits,
+            Preparation(
+                bayer=bayer,
+                demosaicing=demosaic,
+                downsample=downsample,
+                corner=options.read_corner(corner),
+                psf_scale=psf_scale,
+                crop=options.read_crop(crop),
+                saturation=saturation,
+                noise_threshold=noise_threshold,
+                psf_channels=psf_channels,
+            ),
+            psf_bits,
+            options.read_distances(distances, psf),
+        )
+        recipe = Recipe(
+            method=method.replace("-", "_"),
+            tau=tau,
+            iterations=iterations,
+            coupling=coupling,
+            field=field,
+            flip=flip,
+            ridge=ridge,
+            noise=noise,
+            focusing=focusing,
+        )
+        balance, unsure = options.read_white_balance(white_balance), focusing is not None
+        output = Output(out, linear, gamma, balance, unsure)
+        end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
     if end:
         raise typer.Exit(end)
 
@@ -202,33 +199,30 @@ def check(
         from thincam_jax.commands.reconstruct.options import Sources
         from thincam_jax.commands.reconstruct.run import check_files, enough_blocks
         from thincam_jax.commands.terminal import progress_bar
-        from thincam_jax.measured import MeasurementError, Preparation
+        from thincam_jax.measured import Preparation
 
-        try:
-            sources = Sources(
-                psf,
-                options.read_background(background),
-                options.read_background(psf_background),
-                dead,
-                bits,
-                Preparation(
-                    bayer=bayer,
-                    downsample=1 if downsample is None else downsample,
-                    corner=options.read_corner(corner),
-                    psf_scale=psf_scale,
-                    crop=options.read_crop(crop),
-                    psf_channels=psf_channels,
-                ),
-                psf_bits,
+        sources = Sources(
+            psf,
+            options.read_background(background),
+            options.read_background(psf_background),
+            dead,
+            bits,
+            Preparation(
+                bayer=bayer,
+                downsample=1 if downsample is None else downsample,
+                corner=options.read_corner(corner),
+                psf_scale=psf_scale,
+                crop=options.read_crop(crop),
+                psf_channels=psf_channels,
+            ),
+            psf_bits,
+        )
+        sources = enough_blocks(sources, capture) if downsample is None else sources
+        with progress_bar() as bar:
+            task = bar.add_task("PSFs", total=None)
+            lines, fits = check_files(
+                sources, capture, search, lambda n, of: bar.update(task, completed=n, total=of)
             )
-            sources = enough_blocks(sources, capture) if downsample is None else sources
-            with progress_bar() as bar:
-                task = bar.add_task("PSFs", total=None)
-                lines, fits = check_files(
-                    sources, capture, search, lambda n, of: bar.update(task, completed=n, total=of)
-                )
-        except (MeasurementError, OSError) as error:
-            fail(error)
     say_result("findings", lines, "\n".join(lines))
     if not fits:
         raise typer.Exit(1)

@@ -71,8 +71,7 @@ def sweep(
         points = make_points(study, axes, is_double())
         folder = SweepFolder.chosen(out, f"{study.name}-sweep", study)
         if dry_run:
-            writes = f"{len(points)} points; {folder.outcome(study)}"
-            explain.dry_run(study, writes)
+            explain.dry_run(study, f"{len(points)} points; {folder.outcome(study)}")
             return
         folder.claim(study)
         warn(doubts(points))
