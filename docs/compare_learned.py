@@ -25,6 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from refocusing_baselines import ControlCode, control_loss
 from scipy.stats import t as student
 from score_refocusing import (
     FAR,
@@ -43,7 +44,6 @@ from score_refocusing import (
 )
 
 from thincam_jax import learn
-from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss
 from thincam_jax.learn.refocusing.sources import drawn, photographs, samples
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import Task, train_model

@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from refocusing_baselines import wiener
+from refocusing_scores import scores
 
 import thincam_jax as tc
 from thincam_jax import learn
-from thincam_jax.learn.refocusing.baselines import wiener
-from thincam_jax.learn.refocusing.evaluation import scores
 from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.planes import Planes

@@ -21,19 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from refocusing_baselines import wiener
+from refocusing_scores import capture_scene, flat_scene, scores, sub_aperture_capture, with_noise
 from scipy import ndimage
 
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
-from thincam_jax.learn.refocusing.baselines import wiener
-from thincam_jax.learn.refocusing.evaluation import (
-    capture_scene,
-    flat_scene,
-    scores,
-    sub_aperture_capture,
-    with_noise,
-)
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.scenes import captured
 from thincam_jax.learn.refocusing.sources import photographs

@@ -39,6 +39,16 @@ def full_disk(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+def read_fiducial(pixels: Any, bit_depth: int) -> Any:
+    """The fiducial that a virtual rig writes into the corner of a frame."""
+    from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Fiducial
+
+    rows, columns = FIDUCIAL_SHAPE
+    bits = pixels[:rows, :columns] > 2 ** (bit_depth - 2)
+    words = np.packbits(bits).view(">u4").astype(np.int64)
+    return Fiducial(int(words[0]), int(words[1]) - 2**31, int(words[2]))
+
+
 def recipe(name: str) -> str:
     """The code of "## Adding …" in CONTRIBUTING.md."""
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8").split(f"## Adding {name}\n")[1]

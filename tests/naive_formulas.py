@@ -1,9 +1,14 @@
 """Formulas as textbooks have them, which fail at extremes where the package's do not."""
 
 import extremes
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.special
 from extremes import PARAMETERS, Extreme
+
+from thincam_jax._core.precision import phasor
+from thincam_jax.lensless.masks.base import require_zone_orders
 
 
 def axes(extreme: Extreme, dtype):
@@ -124,3 +129,46 @@ NAIVE = {
     "added phase": added_phase,
     "pixel's ends": pixel_ends,
 }
+
+
+def harmonic_response(mask, path, harmonic: int, frequency_squared):
+    r"""Response of a harmonic m > 0 of the captures over the mask's phase (`harmonic_otf`), mm².
+
+    For ρ² in cycles²/mm² on the sensor. The pairs of orders that differ by m share a carrier, with
+    X = π²ρ²/β, ε = βλd/π (and β/M² for β, ε/M for ε from a near point):
+
+    .. math::
+        H_m = \frac{j\pi}{m\beta} \sum_{k-l=m} c_k c_l^*\, e^{-j(X/m)(1+k\epsilon)(1+l\epsilon)}
+
+    with the mask's own phase in the c_k; exact for the unbounded mask. Behind a finite one it ends
+    at mβR/π, R half its width. To first order in ε the sum is that of two copies of the mask
+    shifted apart; for the binary profile
+
+    .. math::
+        H_m \approx \frac{j}{m^2\beta}\, e^{-jX/m} \times \begin{cases}
+            \sin(m\pi/2)\,\cos(\pi\lambda d\rho^2) & m\ \text{odd}\\
+            -\cos(m\pi/2)\,\sin(\pi\lambda d\rho^2) & m\ \text{even},\
+                \lambda d\rho^2 < m/2
+        \end{cases}
+
+    The odd ones are so to all orders, since 0 is the only even order of the binary profile, and
+    share their zeros. The even ones, which the geometric shadow lacks, are largest there.
+    """
+    zones = require_zone_orders(mask, "closed_form")
+    orders = zones.orders
+    found = [
+        (orders.index(low + harmonic), place)
+        for place, low in enumerate(orders)
+        if low + harmonic in orders
+    ]
+    if harmonic < 1:
+        raise ValueError(f"harmonic = {harmonic}; give a whole number from 1 on")
+    squared = jnp.asarray(frequency_squared, zones.beta.dtype)[..., None]
+    first, second = np.asarray(found, int).reshape(-1, 2).T
+    k = jnp.asarray(orders, dtype=zones.beta.dtype)
+    gain = 1 + k * path.epsilon(zones.beta)
+    beta = harmonic * zones.beta / path.magnification**2
+    phases = phasor(-(jnp.pi**2) * squared / beta * gain[first] * gain[second])
+    weights = zones.coefficients[first] * zones.coefficients[second].conj()
+    quadrature = jax.lax.complex(jnp.zeros_like(beta), jnp.pi / beta)
+    return jnp.sum(weights * phases, axis=-1) * quadrature

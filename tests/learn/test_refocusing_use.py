@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from learn import tiny_network as tiny
+from refocusing_baselines import wiener
+from refocusing_scores import capture_scene, flat_scene, scores
 
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera
 from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
-from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.learn.refocusing.evaluation import capture_scene, flat_scene, scores
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.sources import drawn
 from thincam_jax.learn.refocusing.store import (

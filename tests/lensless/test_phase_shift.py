@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from naive_formulas import harmonic_response
 
 import thincam_jax as tc
 from helpers import quick, relative_l2
-from thincam_jax.lensless.propagation.closed_form import harmonic_response
 
 # Weak diffraction (ε = 4e-5), so that ε in the chirps' curvatures does not show; the zero of
 # cos(πλdρ²) is made to lie in the band by a frequency grid that reaches far.

@@ -14,7 +14,6 @@ from thincam_jax.reconstruction.regularisers import (
     Cosines,
     Sparsity,
     Wavelet,
-    denoise,
     prox,
     zero_dual,
 )
@@ -28,6 +27,14 @@ REGULARISERS = [
     Sparsity(Wavelet("daubechies4", 2)),
     Sparsity(Cosines()),
 ]
+
+
+@functools.partial(jax.jit, static_argnames=("nonnegative", "iterations"))
+def denoise(image, step, regulariser, *, nonnegative=False, iterations=100):
+    """The x that minimises ½‖x − image‖² + step·R(x), from a dual of zero."""
+    dual, step = zero_dual(regulariser, image), jnp.asarray(step, image.dtype)
+    options = {"nonnegative": nonnegative, "iterations": iterations}
+    return prox(regulariser, image, step, dual, **options)[0]
 
 
 @functools.partial(jax.jit, static_argnames="nonnegative")

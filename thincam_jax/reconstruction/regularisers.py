@@ -151,29 +151,6 @@ def first_momentum(image: Image) -> Float[Array, "*batch 1 1 1 1"]:
     return jnp.ones((*image.shape[:-4], 1, 1, 1, 1), image.dtype)
 
 
-def denoise(
-    image: Image,
-    step: Number,
-    regulariser: AbstractRegulariser,
-    *,
-    nonnegative: bool = False,
-    iterations: int = 100,
-) -> Image:
-    r"""Denoise: the x that minimises ½‖x − image‖² + step·R(x), with x ≥ 0 if constrained.
-
-    With R = TV it is the denoising of Rudin, Osher and Fatemi. `step` has the unit of the image; a
-    larger one removes larger differences.
-    """
-    step = jnp.asarray(step, image.dtype)
-    return _denoise(image, step, regulariser, nonnegative, iterations)
-
-
-@functools.partial(jax.jit, static_argnames=("nonnegative", "iterations"))
-def _denoise(image, step, regulariser, nonnegative: bool, iterations: int):
-    dual = zero_dual(regulariser, image)
-    return prox(regulariser, image, step, dual, nonnegative=nonnegative, iterations=iterations)[0]
-
-
 class Wavelet(eqx.Module):
     r"""An orthonormal wavelet transform over the last two axes, for images of any size.
 

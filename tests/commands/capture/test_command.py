@@ -17,7 +17,7 @@ import yaml
 from commands.capture import tiny
 from commands.test_cli import call, one_line
 
-from helpers import ROOT, recipe
+from helpers import ROOT, read_fiducial, recipe
 from thincam_jax.commands.capture import command
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
@@ -26,7 +26,7 @@ from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.displays.patterns import pattern_levels
 from thincam_jax.hardware.registry import driver_report
 from thincam_jax.hardware.virtual import devices
-from thincam_jax.hardware.virtual.rig import pattern_number, read_fiducial
+from thincam_jax.hardware.virtual.rig import pattern_number
 from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.measured.calibration import open_matrix, read_matrix
 

@@ -7,19 +7,14 @@ import pytest
 import scipy
 
 import thincam_jax as tc
+from helpers import read_fiducial
 from thincam_jax.hardware import CameraSettings, Region, registry
 from thincam_jax.hardware.errors import NotFound
 from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, cells_shown
-from thincam_jax.hardware.virtual.rig import (
-    Electronics,
-    Fiducial,
-    VirtualRig,
-    pattern_number,
-    read_fiducial,
-)
+from thincam_jax.hardware.virtual.rig import Electronics, Fiducial, VirtualRig, pattern_number
 from thincam_jax.imaging.operators import Matrix, Sparse
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.units import nm, um

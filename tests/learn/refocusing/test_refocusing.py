@@ -6,17 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from refocusing_baselines import ControlCode, control_loss, wiener
+from refocusing_scores import flat_scene, multiscale_ssim, scores, sub_aperture_capture
 
 import thincam_jax as tc
-from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss, wiener
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.learn.refocusing.evaluation import (
-    flat_scene,
-    multiscale_ssim,
-    scores,
-    sub_aperture_capture,
-)
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork, explain

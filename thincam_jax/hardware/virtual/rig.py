@@ -79,14 +79,6 @@ def pattern_number(shown: UInt8[np.ndarray, "v u"]) -> int:
     return zlib.crc32(np.ascontiguousarray(shown).data)
 
 
-def read_fiducial(pixels: UInt16[np.ndarray, "y x"], bit_depth: int) -> Fiducial:
-    """Read the fiducial in the corner of a frame."""
-    rows, columns = FIDUCIAL_SHAPE
-    bits = pixels[:rows, :columns] > 2 ** (bit_depth - 2)
-    words = np.packbits(bits).view(">u4").astype(np.int64)
-    return Fiducial(int(words[0]), int(words[1]) - 2**31, int(words[2]))
-
-
 def _write_fiducial(pixels: UInt16[np.ndarray, "y x"], fiducial: Fiducial, bit_depth: int) -> None:
     words = np.array([fiducial.pattern, fiducial.position + 2**31, fiducial.exposure], ">u4")
     bits = np.unpackbits(words.view(np.uint8)).reshape(FIDUCIAL_SHAPE)

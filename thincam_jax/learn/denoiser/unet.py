@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax.learn.refocusing.unet import blocks_to_channels, channels_to_blocks
+from thincam_jax.learn.refocusing.unet import blocks_to_channels, channels_to_blocks, convolved
 
 _IMAGES = 5  # of the input: the four pixels of a block, and the noise level
 
@@ -22,7 +22,7 @@ class Residual(eqx.Module):
         self.second = 0.3 * _kernel(channels, channels, 3, second)
 
     def __call__(self, x: Float[Array, "c y x"]) -> Float[Array, "c y x"]:
-        return x + _convolved(jax.nn.relu(_convolved(x, self.first)), self.second)
+        return x + convolved(jax.nn.relu(convolved(x, self.first)), self.second)
 
 
 class Level(eqx.Module):
@@ -53,8 +53,8 @@ class Level(eqx.Module):
             x = block(x)
         if self.inner is not None:
             assert self.down is not None and self.up is not None
-            coarse = self.inner(_convolved(x, self.down, stride=2))
-            x = x + channels_to_blocks(_convolved(coarse, self.up))
+            coarse = self.inner(convolved(x, self.down, stride=2))
+            x = x + channels_to_blocks(convolved(coarse, self.up))
         for block in self.after:
             x = block(x)
         return x
@@ -99,19 +99,11 @@ class DenoisingUNet(eqx.Module):
         padded = jnp.pad(image, ((0, -rows % multiple), (0, -columns % multiple)), "reflect")
         pixels = blocks_to_channels(padded[None])
         level = jnp.broadcast_to(sigma.astype(image.dtype), (1, *pixels.shape[1:]))
-        x = self.levels(_convolved(jnp.concatenate([pixels, level]), self.enter))
-        return channels_to_blocks(_convolved(x, self.leave))[0, :rows, :columns]
+        x = self.levels(convolved(jnp.concatenate([pixels, level]), self.enter))
+        return channels_to_blocks(convolved(x, self.leave))[0, :rows, :columns]
 
 
 def _kernel(inputs: int, outputs: int, side: int, key: PRNGKeyArray) -> Array:
     """By He: keeps the variance through a ReLU."""
     spread = (2 / (side**2 * inputs)) ** 0.5
     return spread * jax.random.normal(key, (outputs, inputs, side, side))
-
-
-def _convolved(x: Array, kernel: Array, stride: int = 1) -> Array:
-    padding = "SAME" if kernel.shape[-1] == 3 else "VALID"
-    kernel = kernel.astype(x.dtype)
-    return jax.lax.conv_general_dilated(
-        x[None], kernel, (stride, stride), padding, precision="highest"
-    )[0]

@@ -20,11 +20,7 @@ class Convolution(eqx.Module):
         self.bias = jnp.zeros((outputs, 1, 1))
 
     def __call__(self, image: Float[Array, "in y x"]) -> Float[Array, "out y x"]:
-        weight = self.weight.astype(image.dtype)
-        out = jax.lax.conv_general_dilated(
-            image[None], weight, (1, 1), "SAME", precision="highest"
-        )[0]
-        return out + self.bias.astype(image.dtype)
+        return convolved(image, self.weight) + self.bias.astype(image.dtype)
 
 
 class Residual(eqx.Module):
@@ -81,6 +77,15 @@ class UNet(eqx.Module):
         for up, after, level in zip(self.up[::-1], self.after[::-1], levels[::-1], strict=True):
             x = after(level + _doubled(up(x)))
         return channels_to_blocks(self.leave(jax.nn.relu(x)))[:, :rows, :columns]
+
+
+def convolved(x: Array, kernel: Array, stride: int = 1) -> Array:
+    """Images (channel, y, x) by a kernel; one of 3×3 has zeros beside them."""
+    padding = "SAME" if kernel.shape[-1] == 3 else "VALID"
+    kernel = kernel.astype(x.dtype)
+    return jax.lax.conv_general_dilated(
+        x[None], kernel, (stride, stride), padding, precision="highest"
+    )[0]
 
 
 def parameter_count(tree: Any) -> int:
