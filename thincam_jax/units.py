@@ -37,7 +37,7 @@ deg: float = math.pi / 180.0
 
 @dataclass(frozen=True)
 class _Kind:
-    """What one kind of quantity is called, accepts and turns into."""
+    """Name, accepted units and canonical unit of one kind of quantity."""
 
     unit: str  # of the package, as a file has it
     name: str  # with its article, as it stands in a sentence

@@ -1,1 +1,1 @@
-"""What every room uses: checks, files, memory, precision, grids."""
+"""Foundations of every room: checks, files, memory, precision, grids."""

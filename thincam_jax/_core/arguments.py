@@ -61,7 +61,7 @@ def checked(public: _Public) -> _Public:
 
 
 def _words(kinds: _Kinds) -> str:
-    """What to give, each once."""
+    """Allowed kinds in words, each once."""
     words = dict.fromkeys(kind.words() for kind in kinds)
     if "a number" in words:
         words.pop("a whole number", None)
@@ -176,7 +176,7 @@ def _array(annotation: Any) -> _Kind:
 
 
 def _constructor(kind: type) -> str:
-    """What to write for an object of the class: "Sensor(shape, pitch, …)"."""
+    """Call that makes an object of the class: "Sensor(shape, pitch, …)"."""
     if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
         return f"an {kind.__name__}, such as {next(_concrete(kind), kind).__name__}"
     given = list(inspect.signature(kind).parameters.values())

@@ -26,7 +26,7 @@ class Control:
 
 @runtime_checkable
 class Message(Protocol):
-    """What a setting looks like."""
+    """Picture of a setting."""
 
     def message(self) -> tuple[str, list[bytes]]:
         """A header as JSON, and the pictures in the order of its `names`."""
@@ -35,7 +35,7 @@ class Message(Protocol):
 
 @runtime_checkable
 class Controlled(Protocol):
-    """What a page turns and shows.
+    """Controls and pictures of a page.
 
     - `captions`: of its pictures, by name, "transfer" that of a curve; None for those of a camera.
     - `live`: whether it changes by itself, so that the page goes on asking.

@@ -90,7 +90,7 @@ def _fault(error: Any, places: Places, model: Any) -> tuple[str, str, str]:
 
 
 def _message(error: Any, location: tuple, model: Any) -> str:
-    """What is wrong and what is allowed, in the words of an experiment file."""
+    """Fault and allowed values, in the words of an experiment file."""
     kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
     if kind == "extra_forbidden":
         return f"unknown key; allowed here: {', '.join(_allowed(location[:-1], model))}"

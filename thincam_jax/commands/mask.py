@@ -19,7 +19,7 @@ APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 
 
 class ApertureConfig(section(masks.FresnelZoneAperture, only=APERTURE)):
-    """What all Fresnel zone apertures share; `pixel_pitch`, `fill_factor`: of a display."""
+    """Keys of all Fresnel zone apertures; `pixel_pitch`, `fill_factor`: of a display."""
 
     @pydantic.model_validator(mode="after")
     def _display(self):

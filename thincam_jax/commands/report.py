@@ -1,4 +1,4 @@
-"""What a report shows: texts, tables and figures in parts, the same for pages and terminals."""
+"""Contents of a report: texts, tables and figures in parts, for pages and terminals."""
 
 import base64
 import io

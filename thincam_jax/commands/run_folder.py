@@ -98,7 +98,7 @@ class RunFolder:
             raise ConfigError(text) from None
 
     def outcome(self, config: Section) -> str:
-        """What a run would write, in a line; ConfigError where `make` would refuse the folder."""
+        """Files that a run would write, in a line; ConfigError where `make` refuses the folder."""
         if self.path.exists():
             self._refuse_foreign(config)
         folders = [f"{folder}/" for folder in self.folders]

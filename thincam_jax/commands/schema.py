@@ -131,7 +131,7 @@ def _parameters(maker: Callable[..., Any]) -> dict[str, tuple[Any, Any]]:
 
 
 def _type(known: Quantity | None, converter: Callable[[Any], Any] | None, annotation: Any) -> Any:
-    """What pydantic reads: a number with its unit, a choice, or the plain type of an annotation."""
+    """Type for pydantic: a number with its unit, a choice, or the plain type of an annotation."""
     plain = _plain(annotation)
     if known is None:
         return Annotated[plain, AfterValidator(_checked(converter))] if converter else plain
@@ -193,7 +193,7 @@ def form_of(kind: str, positive: bool = False) -> dict[str, Any]:
 
 
 def written(given: Quantity) -> tuple[Any, ...]:
-    """How a number with a unit is read and written in a file."""
+    """Reader and printer of a number with a unit in a file."""
 
     def read(text: object) -> float:
         value = parse_quantity(text, given.kind)
@@ -207,7 +207,7 @@ def written(given: Quantity) -> tuple[Any, ...]:
 
 
 def descriptions(maker: Callable[..., Any]) -> dict[str, str]:
-    """What the docstring says of each parameter, "- `name`: text"."""
+    """Text of the docstring on each parameter, "- `name`: text"."""
     found: dict[str, str] = {}
     for names, text in re.findall(
         r"^- ((?:`\w+`(?:, )?)+): (.*(?:\n  \S.*)*)", inspect.getdoc(maker) or "", re.MULTILINE

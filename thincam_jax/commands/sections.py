@@ -198,7 +198,7 @@ class PictureConfig(TargetConfig):
 
 
 class ExperimentConfig(Section):
-    """What every kind of experiment file begins with."""
+    """Keys that every kind of experiment file begins with."""
 
     pictured: ClassVar[str] = "targets"  # the list that has image files
     name: Name
@@ -214,7 +214,7 @@ class ExperimentConfig(Section):
     def read_each(
         self, entries: str, read: Callable[[Any], Found], *key: str
     ) -> tuple[list[Found], list[str]]:
-        """What a function makes of each entry of a list, and a line for each that it refuses.
+        """Results of a function for each entry of a list, and a line for each that it refuses.
 
         `key`: the entry's own, which a line blames.
         """
@@ -261,7 +261,7 @@ class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
 
     @property
     def motion(self) -> float:
-        """How far objects move during an exposure of the sensor's own time, mm."""
+        """Motion of objects during an exposure of the sensor's own time, mm."""
         return 0.0
 
     @pydantic.model_validator(mode="after")

@@ -31,7 +31,7 @@ _SATURATED = (255, 40, 40)  # the colour of full pixels
 
 @dataclass(frozen=True)
 class FrameNumbers:
-    """What a frame tells of exposure and focus.
+    """Exposure and focus of a frame.
 
     - `brightest`: count that a thousandth of the pixels exceeds, over the largest that there is.
     - `saturated`: share of full pixels. `focus`: mean squared Laplacian over the mean squared: it

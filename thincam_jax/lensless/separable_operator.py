@@ -117,7 +117,7 @@ def _factors(camera, scene: Scene, grid: Grid, method: PsfMethod):
 
 @jax.jit(static_argnames="shape")
 def _weights(camera: LenslessCamera, plane: ImagePlane, shape: tuple[int, int]):
-    """What the projected pixels of an image contribute to `shape` samples, per axis."""
+    """Contributions of the projected pixels of an image to `shape` samples, per axis."""
     grid = Grid(shape, camera.sensor.pitch)
     return plane.weights(grid, magnification=-camera.distance / plane.distance)
 

@@ -325,7 +325,7 @@ def _mark_reference(ax: Axes, point: PointScores, value: str, name: str) -> None
 
 
 def _steps(ax: Axes, points: Sequence[PointScores], value: str, flag: str, dash: str) -> None:
-    """What is reached at each cost: the best of the points up to there."""
+    """Draw the best value reached up to each cost."""
     front = sorted((p.cost, getattr(p, value)) for p in points if not getattr(p, flag))
     if not front:
         return

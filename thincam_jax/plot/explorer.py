@@ -47,7 +47,7 @@ _TOLERANCE = Control("tolerance", "tolerance", "%", 0.1, 20.0, 1.0, 1e-2)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a setting looks like.
+    """Picture of a setting.
 
     - `pictures`: files of "psf", and at rest of "capture" and "image": JPEG, at rest PNG.
     - `step`: cycles/mm from one entry of `transfer`, |H| along u at v = 0 over its value at low
@@ -195,7 +195,7 @@ class Explorer:
         return replace(seen, pictures=seen.pictures | files, zero=_zero(camera, light), lines=lines)
 
     def _about_the_psf(self, camera: LenslessCamera, light: dict[str, Any]) -> list[str]:
-        """What a cheaper model changes, and the angle."""
+        """Changes by a cheaper model, and by the angle."""
         tolerance = self.values["tolerance"]
         chosen = select_model(
             camera, tolerance=tolerance * _TOLERANCE.scale, pixel_integration=True, **light

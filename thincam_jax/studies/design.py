@@ -148,7 +148,7 @@ class DesignStudy:
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know before it runs."""
+        """Warnings before it runs."""
         return self.study.warnings
 
     def with_designs(self, designs: Mapping[str, Design]) -> Study:

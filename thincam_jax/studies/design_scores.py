@@ -89,7 +89,7 @@ def reported_names(designs: Iterable[WithShots]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ObjectiveScores:
-    """What a search minimised.
+    """Objective of a search.
 
     - `label`: quantity and unit of the reported values. `unit`: of gains.
     - `prior_exponent`: of the scene's spectrum.
@@ -106,7 +106,7 @@ class ObjectiveScores:
 
 @dataclass(frozen=True)
 class SearchScores:
-    """How a search went.
+    """Course of a search.
 
     - `approximation_off`: how far values as searched are from the exact ones at most, as reported.
     - `broken_limits`: that the design to beat does not keep, in words.
@@ -121,7 +121,7 @@ class SearchScores:
 
 @dataclass(frozen=True)
 class TrainingScores:
-    """How a training went."""
+    """Course of a training."""
 
     reconstruction: str
     images: tuple[str, ...]
@@ -313,7 +313,7 @@ class DesignScores:
     held_out: HeldOut | None = None
 
     def levels(self) -> str:
-        """What the gains are over, in a sentence."""
+        """Design and photographs that the gains refer to, in a sentence."""
         name = self.reference.name
         of_pictures = self.validation.methods[name]
         levels = {target: of_pictures[target].psnr_db for target in self.validation.pictures}
@@ -358,7 +358,7 @@ class DesignScores:
         return Table(headings, rows, words=(len(headings) - 1,))
 
     def findings(self) -> list[str]:
-        """What the numbers say, in sentences."""
+        """Findings in sentences."""
         best, reference, validation = self.found[0], self.reference, self.validation
         names = reported_names([best, reference])
         by = "training" if self.training else self.objective.name
@@ -397,7 +397,7 @@ class DesignScores:
         return sentences
 
     def _beside_others(self) -> list[str]:
-        """What random designs reach, and what is gained on further photographs."""
+        """Random designs beside the found ones, and the gain on further photographs."""
         best, random, held_out = self.found[0].name, self.random, self.held_out
         sentences = []
         if random is not None:

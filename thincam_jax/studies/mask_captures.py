@@ -59,7 +59,7 @@ class ComparedMask:
 @checked
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What all masks have in common.
+    """Setting that all masks share.
 
     - `sensor`: shape and pitch; how long it is exposed follows from the light.
     - `distance`: mask to sensor, mm; `field`: pixels (rows, columns) that the scene covers there.
@@ -80,7 +80,7 @@ class Setting:
 
 
 class Seen(eqx.Module):
-    """What is known of scenes from their captures.
+    """Statistics of scenes from their captures.
 
     - `channels`: sums of captures; `variance`: of their noise, for each scene.
     - `level`: brightness of the uniform scene that explains the captures best, which sums that
@@ -226,7 +226,7 @@ def total_variation(
 
 @dataclass(frozen=True)
 class Strength:
-    """What a mask does with the light, from its PSF: parts of one; `weakest_at` in cycles/mm.
+    """Light and response of a mask, from its PSF: parts of one; `weakest_at` in cycles/mm.
 
     - `throughput`: light of the open width that falls on sensor and surroundings.
     - `detail`: root mean square of |H| over H(0), from one cycle a field to half of Nyquist.

@@ -227,7 +227,7 @@ def _stack(scenes: Sequence[ComparedScene]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class MaskComparisonResult:
-    """What a comparison found.
+    """Result of a comparison.
 
     - `scores`: PSNR in dB, and SSIM, of each case; `images`: its reconstruction (y, x).
     - `tau`: by mask and light. `strengths`, `psfs`: by mask, far away in one wavelength.
@@ -292,7 +292,7 @@ class MaskComparisonResult:
         return Table(headings, rows, title=f"PSNR dB / SSIM by {estimate}, at electrons a pixel")
 
     def strength_table(self) -> Table:
-        """What the PSF of every mask says by itself; see `Strength`."""
+        """Properties of the PSF of every mask; see `Strength`."""
         rows = []
         for name, one in self.strengths.items():
             of_light = one.throughput, one.detail, one.in_shot_noise, one.in_read_noise
@@ -311,7 +311,7 @@ class MaskComparisonResult:
         return Table(headings, rows, (1, 1, 1, 2, 2, 2, 1, 0))
 
     def cost_table(self) -> Table:
-        """What colours, distance and the PSF of a wrong distance cost, dB."""
+        """Costs of colours, of distance and of the PSF of a wrong distance, dB."""
         rows = [
             (name, self.broadband(name), self.near(name), self.unfocused(name))
             for name in self.comparison.masks

@@ -113,7 +113,7 @@ def _field(prepared: Prepared) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class PreparedFacts:
-    """How a prepared capture was reconstructed; `history` of the steps that were reported."""
+    """Reconstruction of a prepared capture; `history` of the steps that were reported."""
 
     method: str
     noise_standard_deviation: float
@@ -164,7 +164,7 @@ class PreparedResult:
 
     @property
     def facts(self) -> "PreparedFacts":
-        """What was solved, and how it ended."""
+        """Solver, status and steps in a line."""
         found = self.found
         return PreparedFacts(
             found.method,

@@ -223,7 +223,7 @@ class ReconstructionCosts:
     controlled: tuple[ControlledCost, ...]
 
     def verdict(self) -> str:
-        """What a PSF error of 1 % costs, or why nothing was reconstructed."""
+        """Cost of a PSF error of 1 %, or why nothing was reconstructed."""
         if self.skipped:
             return f"no reconstruction: {self.skipped}"
         lost = [

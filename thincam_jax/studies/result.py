@@ -83,7 +83,7 @@ class StudyScores:
         return Table(headings, rows, (1,) * (len(headings) - 1), published=(len(headings) - 1,))
 
     def resolution_table(self) -> Table:
-        """What every method resolves, and its limits, beside what was published."""
+        """Resolution and limits of every method, beside published ones."""
         rows = [
             (
                 name,
@@ -234,12 +234,12 @@ def _rank(method: MethodScores) -> tuple[float, float]:
 
 
 def _sums(method: Method) -> tuple:
-    """What two methods share that add and subtract the same captures in the same way."""
+    """Captures and synthesis of a method; equal for methods that add the same captures alike."""
     return tuple(method.exposures), method.synthesis, method.phases, method.harmonics
 
 
 def _gains(study: Study, scores: StudyScores) -> list[str]:
-    """What total variation adds to the Wiener synthesis of the same captures."""
+    """Gain of total variation over the Wiener synthesis of the same captures."""
     sentences = []
     for method in (m for m in study.methods if m.solver.name == "admm_tv"):
         for other in (m for m in study.methods if m.solver.name == "wiener"):

@@ -37,7 +37,7 @@ FrameSolver = Callable[[Float[np.ndarray, "capture y x"]], Reconstruction]
 
 @dataclass(frozen=True)
 class CountingCamera:
-    """What a camera makes of light, for the noise of its frames.
+    """Response of a camera to light, for the noise of its frames.
 
     - `counts`: of a unit of the noise-free image; `electron`: counts of an electron.
     - `read_noise`: in electrons; `offset`: counts that were not subtracted.

@@ -277,7 +277,7 @@ def _bounce(guided: Array, index: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ModelResult:
-    """What a model gives: its mistake in words, and the reconstructions by name of the solver."""
+    """Result of a model: its mistake in words, and the reconstructions by name of the solver."""
 
     mistake: str
     methods: dict[str, Reconstructed]

@@ -45,7 +45,7 @@ _SHOWN = 3  # cells whose columns of the matrix are compared with the exact ones
 
 @dataclass(frozen=True)
 class Calibration:
-    """How a matrix is measured, and the rays that are fitted to it.
+    """Measurement of a matrix, and the rays that are fitted to it.
 
     - `order`, `display`, `dark_frames`: see `HadamardSeries`. `bits`: of the camera.
     - `exposure`: part of the camera's range that a white monitor fills; `offset`: its dark level
@@ -158,7 +158,7 @@ class FittedValue:
 
 @dataclass(frozen=True)
 class FitScores:
-    """How the fit of the screen ended, and its parameters by name; see `ScreenFit`."""
+    """Status of the fit of the screen, and its parameters by name; see `ScreenFit`."""
 
     status: str
     reasons: tuple[str, ...]

@@ -20,14 +20,14 @@ from thincam_jax.studies.study import Study, Target
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """What was read out (*channel, y, x), and the variance of its noise (*channel,)."""
+    """Image read out (*channel, y, x), and the variance of its noise (*channel,)."""
 
     image: np.ndarray
     variance: np.ndarray
 
 
 def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
-    """What falls on the sensor, (*channel, y, x): without saturation."""
+    """Light on the sensor, (*channel, y, x), without saturation."""
     scene = Scene(planes, exposure.wavelength)
     images = (
         forward.expose(
@@ -43,7 +43,7 @@ def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[Image
 
 
 def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: int = 0) -> Capture:
-    """What is read out of a noise-free image of the target of a number.
+    """Capture from a noise-free image of the target of a number.
 
     The noise is that of the image; its random key is the same however a study is interrupted, and
     another one for each further trial.

@@ -311,11 +311,11 @@ class Study:
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know before it runs, and in the report."""
+        """Warnings before it runs, and in the report."""
         return [*self._unresolved(), *self._changes()]
 
     def _changes(self) -> list[str]:
-        """What the PSF of the axis leaves out at the corner of the widest target."""
+        """Error of the PSF of the axis at the corner of the widest target."""
         if self.field_tolerance is not None or not self.targets:
             return []
         if self.sensor.angular_response is not None:

@@ -1,4 +1,4 @@
-r"""How much light a volume hologram diffracts.
+r"""Diffraction efficiency of a volume hologram.
 
 Kogelnik's coupled waves (Bell Syst. Tech. J. 48, 2909, 1969).
 

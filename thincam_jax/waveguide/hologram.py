@@ -202,7 +202,7 @@ def directions(
 
 
 def _mismatch(wavelength, data):
-    """How much longer a wavelength is than the one that the fringes match at it, times |K|²/4π."""
+    """Excess of a wavelength over the one that the fringes match at it, times |K|²/4π."""
     index, across, squared, along, power = data
     inside = jnp.sqrt(index(wavelength) ** 2 - squared)
     return wavelength * power / (4 * jnp.pi) - across - inside * along

@@ -58,7 +58,7 @@ class LitPlane(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How to model a screen's capture within a tolerance; made by `waveguide.plan`.
+    """Model of a screen's capture within a tolerance; made by `waveguide.plan`.
 
     Print it for a table. It holds for images like the one that it was made for.
 
@@ -126,7 +126,7 @@ class Plan:
 def plan(
     camera: SeeThroughCamera, scene: LitPlane | Sequence[LitPlane], *, tolerance: float
 ) -> Plan:
-    r"""How to model the capture of a scene to a relative error, at the least cost.
+    r"""Choose the cheapest model of the capture of a scene to a relative error.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
     object, 64 parts of each band, dispersion, and double precision. What is decided: how many

@@ -28,7 +28,7 @@ from thincam_jax.waveguide.hologram import directions
 
 
 class RayStatus(enum.IntEnum):
-    """How a ray of one order ended."""
+    """Status of a ray of one order."""
 
     OK = 0
     NO_BRAGG_MATCH = 1  # no wavelength in the film's band is diffracted back
@@ -210,7 +210,7 @@ def on_object(
 
 
 def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
-    """How far light goes sideways in a layer of thickness 1: p/√(n² − p²)."""
+    """Sideways distance of light in a layer of thickness 1: p/√(n² − p²)."""
     squared = jnp.sum(tangential**2, axis=-1)
     return tangential / jnp.sqrt(index**2 - squared)[..., None]
 

@@ -17,7 +17,6 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.commands.screen.run import build_cameras, build_screen, run_screen
-from thincam_jax.imaging.targets import load_image
 from thincam_jax.studies.screen_calibration import MEASURED, calibrate
 
 
@@ -66,8 +65,7 @@ def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
     assert told == found
 
 
-@pytest.mark.thorough
-def test_a_full_colour_hologram_gives_a_colour_picture(tmp_path):
+def test_a_file_of_a_full_colour_hologram(tmp_path):
     overrides = (
         "hologram.wavelength=null",
         "hologram.colours=[630 nm, 532 nm, 460 nm]",
@@ -78,9 +76,8 @@ def test_a_full_colour_hologram_gives_a_colour_picture(tmp_path):
     with pytest.raises(ConfigError, match="calibration: takes a hologram of one colour"):
         tiny.experiment(tmp_path, *overrides)
     study = build_screen(tiny.experiment(tmp_path, *overrides, "calibration=null"))
-    run_screen(study, RunFolder(tmp_path / "out"), Told())
-    image = load_image(tmp_path / "out" / "images" / "face--cgm.png")
-    assert image.shape == (8, 16, 3) and np.ptp(image, axis=-1).max() > 0.1
+    np.testing.assert_allclose(study.wavelengths[0] / study.wavelengths[1], 630 / 532, rtol=1e-6)
+    assert len(study.cameras) == 3 and study.targets["face"].shape == (8, 16, 3)
 
 
 def test_the_angle_of_a_file_is_the_tilt_of_the_plate(tmp_path):

@@ -238,7 +238,7 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
 
 
 def _taken(store: Path, config: "CaptureConfig") -> "Taken":
-    """What a store holds, and how it is to be compared."""
+    """Read the captured frames of a store."""
     import json
 
     import numpy as np

@@ -59,7 +59,7 @@ class PlanConfig(section(PlanRequest)):
 
 
 class AcquisitionConfig(section(Procedure, only=("exposure", "timeout", "retries", "saturated"))):
-    """How frames are taken; see `thincam_jax.hardware.acquisition.Procedure`."""
+    """Procedure of frames; see `thincam_jax.hardware.acquisition.Procedure`."""
 
 
 class OpticsConfig(Section):
@@ -73,7 +73,7 @@ class OpticsConfig(Section):
 
 
 class ReconstructionConfig(Section):
-    """How the image is made; as of a study's methods."""
+    """Reconstruction of the image; as of a study's methods."""
 
     kind: MethodKind = "wiener"
     variation: VariationConfig | None = None
@@ -98,7 +98,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
 
 
 class CaptureConfig(ExperimentConfig):
-    """What a rig captures, `rig: real`, or one that is simulated, `rig: virtual`.
+    """Captures of a rig, `rig: real`, or of a simulated one, `rig: virtual`.
 
     - `display`: a scene needs none; someone covers the camera for dark frames.
     - `targets`: what stands at the object's distance of a virtual rig, one; or the pictures of a

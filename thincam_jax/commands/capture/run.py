@@ -1,4 +1,4 @@
-"""What `thincam run` makes of a store of captures: an image or a system matrix, and a report."""
+"""Reconstruction of a store of captures: an image or a system matrix, and a report."""
 
 import itertools
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ _MATRIX = (
 
 @dataclass(frozen=True)
 class Taken:
-    """What was captured.
+    """Captured frames of a store.
 
     - `seen`: of a Hadamard plan some frames only; its camera is that of a virtual rig.
     - `labels`: what was shown for each. `seconds`: of the steps of the acquisition, by name.

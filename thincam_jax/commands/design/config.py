@@ -203,7 +203,7 @@ class TolerancesConfig(section(Tolerances, defaults=_EXACT)):
 
 
 class SearchConfig(section(SearchSettings, only=LENGTH)):
-    """What is free, within which limits, what is wanted, and how long to search.
+    """Free numbers and their limits, the objective, and the length of the search.
 
     `band`: of `worst_ratio` and `unevenness`, as parts of half of the pixels' Nyquist frequency.
     `grid`: points along each side of the landscape.
@@ -313,7 +313,7 @@ class DesignConfig(LenslessConfig):
         )
 
     def space(self, **limits: float) -> DesignSpace:
-        """What is searched; `limits` in place of the file's.
+        """Space that is searched; `limits` in place of the file's.
 
         **Errors**: FieldError where no design keeps the limits.
         """
@@ -390,7 +390,7 @@ def _check_shots(
 
 
 def _check_search(config: DesignConfig) -> None:
-    """What is asked for against the rest of the file."""
+    """Check the search against the rest of the file."""
     pixel, finest = config.mask.pixel_pitch, config.search.limits.mask_pixel
     if pixel is not None and finest is not None and finest < pixel * (1 - 1e-6):
         message = (

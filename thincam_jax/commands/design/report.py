@@ -94,7 +94,7 @@ def _images(config: DesignConfig, design: DesignScores) -> list[Picture]:
 
 
 def _search(config: DesignConfig, design: DesignScores) -> str:
-    """How the designs were found, what their tolerances mean, and how much was evaluated."""
+    """Search of the designs, meaning of their tolerances, and number of evaluations."""
     training, search = design.training, design.search
     if training:
         names, pixels = training.images, training.pixels

@@ -77,7 +77,7 @@ class TrainingFolder(RunFolder):
 
 @dataclass(frozen=True)
 class Ended:
-    """How a training ended, in a line; the files of its network and its page."""
+    """End of a training, in a line; the files of its network and its page."""
 
     line: str
     network: Path

@@ -47,7 +47,7 @@ class Job:
 
 
 def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
-    """What is to be made of a capture, or of each capture in a folder.
+    """Jobs for a capture, or for each capture in a folder.
 
     Files of the folder that `sources` names are no captures. Nothing is written yet, but whether
     something can be is tried.

@@ -37,7 +37,7 @@ Background = Path | float | int | None
 
 @dataclass(frozen=True)
 class Sources:
-    """What all captures of a run share; see `measured.prepare`.
+    """Sources that all captures of a run share; see `measured.prepare`.
 
     - `psf`: a file, or what `computed_psf` has made. `dead`: a file. `background`,
       `psf_background`: a dark frame's file, a number of counts, or None for the default.
@@ -77,7 +77,7 @@ class Focusing:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to reconstruct; see `thincam_jax.reconstruct`.
+    """Settings of a reconstruction; see `thincam_jax.reconstruct`.
 
     - `method`: one of `PSF_METHODS`.
     - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most;

@@ -34,7 +34,7 @@ _HOLOGRAM = {"wavelength": None, "object_angle": 0.0, "index": 1.5}
 
 
 class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
-    """How both holograms are recorded; angles are in the film, from its normal.
+    """Recording of both holograms; angles are in the film, from its normal.
 
     - `colours`: of a full-colour hologram, the wavelengths of red, green and blue in place of
       `wavelength`, recorded one after the other at the same angles.
@@ -118,7 +118,7 @@ class ModelConfig(section(ScreenModel, without=("name",))):
 
 
 class PublishedConfig(section(PublishedImage, defaults={"psnr_db": ..., "seconds": ...})):
-    """What a publication reports of a target."""
+    """Published figures of a target."""
 
 
 class ScreenTargetConfig(PictureConfig):

@@ -76,7 +76,7 @@ def told(values: dict[str, Any]) -> str:
 
 
 def doubts(points: Sequence[GridPoint]) -> list[str]:
-    """What is said of the first point that has something said of it, and of how many."""
+    """Warnings of the first point that has any, and the number of such points."""
     doubtful = [point for point in points if point.warnings]
     return [
         f"{len(doubtful)} of {len(points)} points; the first ({told(first.values)}): "

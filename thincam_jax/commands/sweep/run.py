@@ -145,7 +145,7 @@ def _column(values: list[Any]) -> pa.Array:
 
 @dataclass(frozen=True)
 class Swept:
-    """How a sweep ended: points, rows of the table, what failed, and the best points in words."""
+    """End of a sweep: points, rows of the table, failures, and the best points in words."""
 
     points: int
     rows: int

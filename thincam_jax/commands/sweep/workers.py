@@ -93,7 +93,7 @@ def _ask(worker: subprocess.Popen, task: tuple) -> Any:
 
 
 def serve() -> None:
-    """What a worker does: a task at a time from standard input, until its other end is closed."""
+    """Do the tasks from standard input one at a time, until its other end is closed."""
     results = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a task prints is no result
     with contextlib.suppress(EOFError):

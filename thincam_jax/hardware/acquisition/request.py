@@ -42,7 +42,7 @@ _CELLS = whole(1, 65536, optional=True, many=True)
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """What is captured.
+    """Captures that a plan is asked for.
 
     - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
       `profile`, `phase`: of all of them.

@@ -1,4 +1,4 @@
-r"""What a scene requires of the field: the PSF and the light of the axis, or those of every point.
+r"""Field model that a scene requires: PSF and light of the axis, or of every point.
 
 What the axis leaves out is a change of the transfer function that grows with the angle,
 :math:`H(\mathbf k; \mathbf u) - H(\mathbf k) \approx \sum_i u_i^2 A_i(\mathbf k) + u_i^4

@@ -68,10 +68,9 @@ _PLACES = {
     "gain": ("gain", ...),
 }
 _FIELDS = quantities(VolumeHologram, Screen, SeeThroughCamera, ObjectPlane)
-_OF_PLACES = {name: place.rpartition(".")[2] for name, (place, _) in _PLACES.items()}
-_OF_PLACES["slant"] = "tilt"
-# Of the fields that the parameters are; those of a ratio have no unit.
-QUANTITIES = {name: _FIELDS.get(_OF_PLACES.get(name, name), unchecked()) for name in PARAMETERS}
+_FIELD_OF = {"slant": "tilt"} | {n: path.rpartition(".")[2] for n, (path, _) in _PLACES.items()}
+# Quantity of the field that each parameter is; ratios have no unit.
+QUANTITIES = {name: _FIELDS.get(_FIELD_OF.get(name, name), unchecked()) for name in PARAMETERS}
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
