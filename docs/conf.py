@@ -71,6 +71,8 @@ TOP = "thincam_jax"
 # The API reference: for each package a page of its public names below their module's first line.
 PACKAGES = (
     TOP,
+    "thincam_jax.lensless",
+    "thincam_jax.lensless.propagation",
     "thincam_jax.imaging.targets",
     "thincam_jax.imaging.operators",
     "thincam_jax.imaging.metrics",
@@ -82,8 +84,11 @@ PACKAGES = (
     "thincam_jax.design",
     "thincam_jax.studies",
     "thincam_jax.learn",
+    "thincam_jax.learn.denoiser",
+    "thincam_jax.learn.refocusing",
     "thincam_jax.plot",
     "thincam_jax.hardware",
+    "thincam_jax.hardware.virtual",
 )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import thincam_jax as tc
 from thincam_jax.design import contour_target, mask_of_phase, one_turn, retrieve_phase
 from thincam_jax.imaging.targets import middle_square, point_grid, sample_image
-from thincam_jax.lensless.propagation.path import Path as LightPath
+from thincam_jax.lensless.propagation import Path as LightPath
 from thincam_jax.studies import ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
 from thincam_jax.units import nm, um
 

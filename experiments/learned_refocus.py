@@ -26,10 +26,8 @@ import PIL.Image
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.learn.refocusing.scenes import SceneOptions, draw_batch
-from thincam_jax.learn.refocusing.sources import drawn
-from thincam_jax.learn.refocusing.use import read
-from thincam_jax.reconstruction.depth.refocus import refocus_distances
+from thincam_jax.learn.refocusing import SceneOptions, draw_batch, drawn, read
+from thincam_jax.reconstruction.depth import refocus_distances
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds

@@ -35,11 +35,10 @@ from thincam_jax.design import (
     write_stl,
 )
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.refractive_index import CauchyIndex, ConstantIndex
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.lensless.masks import MaskBlank, PhaseMask, diffuser, voronoi_fresnel
 from thincam_jax.lensless.propagation import Path as LightPath
 from thincam_jax.units import nm, um
+from thincam_jax.waveguide import CauchyIndex, ConstantIndex
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "phase_mask"
@@ -63,7 +62,7 @@ pixels, across, steps, rounds = {"full": ((32, 40), 26, 60, 60), "small": ((16, 
 pitch, cell, distance, green = 6 * um, 2 * um, 2.0, 532 * nm
 polymer = CauchyIndex(1.504, 0.0042e-6)
 cells = (3 * pixels[0], 3 * pixels[1])
-blank = MaskBlank(cells, cell, polymer)
+blank = tc.MaskBlank(cells, cell, polymer)
 sensor = tc.Sensor(pixels, pitch)
 height, width = cells[0] * cell, cells[1] * cell
 object_distance = 300.0
@@ -121,8 +120,8 @@ without_crop = refine_mask(
 lenses = max(3, round(height * width / 0.15**2))
 focal_length = 1 / (1 / distance + 1 / object_distance)
 masks = {
-    "diffuser": diffuser(keys[3], blank, correlation_length=40 * um, rms_slope=0.024),
-    "Voronoi-Fresnel": voronoi_fresnel(
+    "diffuser": tc.diffuser(keys[3], blank, correlation_length=40 * um, rms_slope=0.024),
+    "Voronoi-Fresnel": tc.voronoi_fresnel(
         keys[3], blank, sites=lenses, focal_length=focal_length, wavelength=green
     ),
     "contours": by_retrieval,
@@ -194,7 +193,7 @@ constant = ConstantIndex(float(polymer(jnp.asarray(green))))
 
 
 def without_dispersion(mask):
-    return PhaseMask(mask.height, mask.pitch, constant)
+    return tc.PhaseMask(mask.height, mask.pitch, constant)
 
 
 each = setting(band)
@@ -322,7 +321,7 @@ figure.savefig(FIGURES / "image.png", dpi=110)
 # closed solid for two-photon printing.
 
 write_height_map(FIGURES / "height_map.png", refined.mask, wavelength=green)
-corner = PhaseMask(refined.mask.height[:24, :24], cell, polymer)
+corner = tc.PhaseMask(refined.mask.height[:24, :24], cell, polymer)
 write_stl(FIGURES / "corner.stl", corner)
 
 # %%

@@ -18,7 +18,7 @@ import PIL.Image
 import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.imaging.targets import sample_image
-from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
+from thincam_jax.studies import pixel_noise, reconstruct_prepared
 from thincam_jax.units import nm, um
 
 SMALL = os.environ.get("THINCAM_SIZE") == "small"

@@ -21,7 +21,6 @@ import numpy as np
 import thincam_jax as tc
 from thincam_jax import design
 from thincam_jax import waveguide as wg
-from thincam_jax.design.plate import noise_variance
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.units import deg, um
@@ -139,7 +138,7 @@ for name, plate in plates.items():
     plane = wg.ObjectPlane(cells, viewing.object_distance, viewing.object_width, middle)
     system = wg.system_operator(camera, plane, 4, 6)
     light = worth[name].light
-    variance = noise_variance(viewing, light) / light**2
+    variance = design.noise_variance(viewing, light) / light**2
     clean = system(jnp.asarray(images["scene"], light.dtype))
     drawn = jax.random.normal(jax.random.key(0), clean.shape, clean.dtype)
     captures = clean + jnp.sqrt(variance) * drawn

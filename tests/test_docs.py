@@ -305,13 +305,49 @@ def test_screen_calibration_page(tmp_path, monkeypatch):
     np.testing.assert_allclose(names["image"], 1, atol=0.02)
 
 
-def test_every_public_name_has_a_heading_in_the_reference():
+def assigned(name: str) -> ast.expr:
+    """The value of a constant of docs/conf.py."""
     conf = ast.parse((ROOT / "docs/conf.py").read_text("utf-8"))
-    (rooms,) = (
-        ast.literal_eval(node.value)
+    (value,) = (
+        node.value
         for node in conf.body
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "ROOMS"
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
     )
+    return value
+
+
+def public(module: str, name: str) -> bool:
+    """Whether the reference lists a module, or a sub-package that is imported by its name."""
+    listed = assigned("PACKAGES")
+    assert isinstance(listed, ast.Tuple)
+    packages = {"thincam_jax", "thincam_jax.units"}
+    packages |= {one.value for one in listed.elts if isinstance(one, ast.Constant)}
+    return module in packages or f"{module}.{name}" in packages
+
+
+USERS = [path.read_text("utf-8") for path in sorted((ROOT / "experiments").glob("*.py"))]
+USERS += [
+    "\n".join(re.findall(r"```py(?:thon)?\n(.*?)```", page, re.DOTALL)) for page in pages().values()
+]
+
+
+def test_scripts_and_pages_need_public_modules_only():
+    """What they import, and in the pages' text what is named with its module."""
+    internal = {
+        f"{node.module}.{alias.name}"
+        for text in USERS
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+        if node.module.startswith("thincam_jax") and not public(node.module, alias.name)
+    }
+    named = re.findall(r"`(thincam_jax(?:\.\w+)*)\.(\w+)[(`]", "\n".join(pages().values()))
+    internal |= {f"{module}.{name}" for module, name in named if not public(module, name)}
+    assert not internal
+
+
+def test_every_public_name_has_a_heading_in_the_reference():
+    rooms = ast.literal_eval(assigned("ROOMS"))
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text("utf-8"))
     modules = {node.module for node in stub.body if isinstance(node, ast.ImportFrom)} - {None}
     assert not [one for one in modules if not one.startswith(tuple(rooms))]

@@ -51,6 +51,7 @@ from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import random_cells as random_cells
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import MODELS as MODELS
+from .lensless.method import AccuracyWarning as AccuracyWarning
 from .lensless.method import PsfMethod as PsfMethod
 from .lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
 from .lensless.phase_shift import harmonic_otf as harmonic_otf

@@ -61,6 +61,7 @@ from thincam_jax.design.plate import PlateLimits as PlateLimits
 from thincam_jax.design.plate import Viewing as Viewing
 from thincam_jax.design.plate import find_plate as find_plate
 from thincam_jax.design.plate import judge_plate as judge_plate
+from thincam_jax.design.plate import noise_variance as noise_variance
 from thincam_jax.design.problem import DesignProblem as DesignProblem
 from thincam_jax.design.problem import FrequencyCounts as FrequencyCounts
 from thincam_jax.design.problem import design_problem as design_problem

@@ -5,8 +5,13 @@ Every device, real or virtual, is a `Camera`, a `Stage` or a `Display`; every fa
 imports nothing of this; the libraries of the devices come with `thincam-jax[hardware]`.
 """
 
+from thincam_jax.hardware.acquisition.acquire import acquire as acquire
+from thincam_jax.hardware.acquisition.plan import method_b as method_b
+from thincam_jax.hardware.acquisition.plan import zone_plate as zone_plate
+from thincam_jax.hardware.acquisition.read import read_acquisition as read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig as Rig
 from thincam_jax.hardware.acquisition.rig import open_rig as open_rig
+from thincam_jax.hardware.acquisition.taker import Procedure as Procedure
 from thincam_jax.hardware.base import Camera as Camera
 from thincam_jax.hardware.base import CameraSettings as CameraSettings
 from thincam_jax.hardware.base import Device as Device

@@ -52,7 +52,21 @@ _LATTICE = (
 
 
 class AccuracyWarning(UserWarning):
-    """A default trades accuracy for time, or planes of an image cannot be told apart."""
+    """A default trades accuracy for time, or planes of an image cannot be told apart.
+
+    ```python
+    import warnings
+
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    camera = tc.LenslessCamera(tc.random_cells(0, 0.9, 30 * um), tc.Sensor((24, 32), 50 * um), 5.0)
+    with warnings.catch_warnings(action="ignore", category=tc.AccuracyWarning):
+        h = tc.psf(camera, wavelength=500 * nm, pixel_integration=True)
+    ```
+
+    **See also**: `PsfMethod`, `SamplingWarning`.
+    """
 
 
 def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:

@@ -15,6 +15,7 @@ from thincam_jax.reconstruction.methods import AdmmTV as AdmmTV
 from thincam_jax.reconstruction.methods import Fista as Fista
 from thincam_jax.reconstruction.methods import choose_solver as choose_solver
 from thincam_jax.reconstruction.methods import reconstruct as reconstruct
+from thincam_jax.reconstruction.noise import estimate_noise as estimate_noise
 from thincam_jax.reconstruction.poisson import Counts as Counts
 from thincam_jax.reconstruction.poisson import PoissonTV as PoissonTV
 from thincam_jax.reconstruction.poisson import solve_poisson as solve_poisson

@@ -2,6 +2,7 @@
 
 from thincam_jax.lensless.exposures import Exposure as Exposure
 from thincam_jax.lensless.exposures import Exposures as Exposures
+from thincam_jax.studies.design import DesignStudy as DesignStudy
 from thincam_jax.studies.evaluate import Evaluation as Evaluation
 from thincam_jax.studies.evaluate import Resolved as Resolved
 from thincam_jax.studies.evaluate import Scores as Scores
@@ -17,6 +18,9 @@ from thincam_jax.studies.mask_comparison import ComparedScene as ComparedScene
 from thincam_jax.studies.mask_comparison import MaskComparison as MaskComparison
 from thincam_jax.studies.mask_comparison import MaskComparisonResult as MaskComparisonResult
 from thincam_jax.studies.mask_comparison import Tuning as Tuning
+from thincam_jax.studies.prepared import pixel_noise as pixel_noise
+from thincam_jax.studies.prepared import reconstruct_prepared as reconstruct_prepared
+from thincam_jax.studies.psf_error_cost import measure_accuracy as measure_accuracy
 from thincam_jax.studies.response import Limits as Limits
 from thincam_jax.studies.response import Response as Response
 from thincam_jax.studies.response import method_response as method_response
