@@ -500,3 +500,9 @@ def test_as_a_process(file):
     assert done.stdout == ""
     assert done.stderr.startswith("thincam: --set mask.width=5: mask.width: 5 has no unit")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [("reconstruct",), ("calibrate", "check")])
+def test_a_file_for_a_command_of_options_is_told_where_to_go(file, words):
+    line = one_line(call(*words, file))
+    assert line == f"{file}: is a study; give it to 'thincam run'"

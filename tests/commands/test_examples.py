@@ -1,5 +1,6 @@
 """`thincam init`: every shipped experiment file can be had, and nothing is overwritten."""
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -58,7 +59,7 @@ def test_any_file_name_is_the_name_of_its_experiment(name, tmp_path):
 
 def test_the_page_of_commands_lists_them():
     page = (ROOT / "docs/files/commands.md").read_text("utf-8")
-    table = page.split("| kind | experiment |")[1].split("\n\n")[0]
+    table = page.split("| example | experiment |")[1].split("\n\n")[0]
     cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     assert sorted(re.findall(r"`(\w+)`", " ".join(cells))) == sorted(kinds.examples())
 
@@ -73,7 +74,7 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
-    named = "study, refocus, design, capture, learned, denoiser, design_both, "
+    named = "study, refocus, screen, design, capture, learned, denoiser, design_both, "
     assert line.startswith(f"init camera: choose one of {named}")
     path = tmp_path / "no" / "study.yaml"
     line = one_line(call("init", "study", "--out", path))
@@ -91,3 +92,14 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     module = Path(kinds.__file__).relative_to(ROOT)
     monkeypatch.setattr(kinds, "__file__", str(tmp_path / module))
     assert kinds.examples() == ["study", "refocus", "design", "capture", "learned", "camera"]
+
+
+def test_a_list_tells_examples_from_kinds(tmp_path):
+    """Every kind is one of them; a file that has a kind's name here keeps its own name, too."""
+    (shown,) = (
+        json.loads(line)["table"] for line in call("init", "--json").stdout.splitlines()[:1]
+    )
+    assert shown["headings"][:2] == ["example", "kind"]
+    assert {row[1] for row in shown["rows"]} == set(kinds.KINDS)
+    assert ["screen", "screen"] in [row[:2] for row in shown["rows"]]
+    assert call("init", "sts_camera", "--out", tmp_path).exit_code == 0

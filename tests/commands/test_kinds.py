@@ -22,7 +22,7 @@ def test_its_parts_are_there(name):
 def test_a_file_goes_to_its_command():
     config = load_experiment(ROOT / "configs/rig_virtual.yaml", command="capture")
     assert kind_of(config) is KINDS["capture"]
-    with pytest.raises(ConfigError, match="kind: is a study; give it to 'thincam run'"):
+    with pytest.raises(ConfigError, match="quick.yaml: is a study; give it to 'thincam run'"):
         load_experiment(ROOT / "configs/quick.yaml", command="train")
 
 

@@ -166,6 +166,7 @@ class TestExplain:
 
     def test_costs_of_its_cameras(self):
         lines = call("explain", ROOT / "configs/quick.yaml").stdout.splitlines()
+        assert any(re.match("pixel_integration: (true|false) ", line) for line in lines)
         costs = [line for line in lines if line.startswith("PSF at ")]
         assert len(costs) == 3  # two distances, and another β at one of them
         assert all("separable, predicted error 0.0" in line and "MiB" in line for line in costs)

@@ -14,3 +14,8 @@ def shortened(text: str, longest: int = 60) -> str:
 def of_error(error: BaseException) -> str:
     """Kind and text of an error of another library, in a line."""
     return shortened(f"{type(error).__name__}: {' '.join(str(error).split())}", 200)
+
+
+def spelled(value: object) -> str:
+    """A value as YAML has it."""
+    return {"None": "null", "True": "true", "False": "false"}.get(repr(value), str(value))

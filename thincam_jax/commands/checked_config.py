@@ -6,7 +6,7 @@ from typing import Any, TypeVar, get_args
 import pydantic
 import yaml
 
-from thincam_jax._core.text import shortened
+from thincam_jax._core.text import shortened, spelled
 from thincam_jax.commands.config_file import ConfigError, Places, override, read_raw
 from thincam_jax.commands.sections import ExperimentConfig
 
@@ -86,7 +86,8 @@ def _fault(error: Any, places: Places, model: Any) -> tuple[str, str, str]:
     if error["type"] == "invalid_key":
         location = (*location[:-1], str(location[-1]))
     field = _dotted(location) or "the file"
-    return places.of(location), field, _message(error, location, model)
+    none = "; for none write null" if repr(error.get("input")).lower() == "'none'" else ""
+    return places.of(location), field, _message(error, location, model) + none
 
 
 def _message(error: Any, location: tuple, model: Any) -> str:
@@ -111,7 +112,7 @@ def _message(error: Any, location: tuple, model: Any) -> str:
 
 
 def _short(given: Any) -> str:
-    return shortened(repr(given))
+    return shortened(repr(given) if isinstance(given, str) else spelled(given))
 
 
 _WORDS = {

@@ -17,7 +17,7 @@ from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers, preview
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
-from thincam_jax.commands.kinds import init
+from thincam_jax.commands.kinds import init, load_experiment
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
@@ -39,11 +39,6 @@ GROUPS = {
     "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
     "Image": ("field", "flip", "linear", "gamma", "white_balance"),
 }
-
-
-def examples_text(*lines: str) -> str:
-    """The end of a help text, its lines kept as they are."""
-    return "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in lines)])
 
 
 class InOrder(TyperGroup):
@@ -91,7 +86,13 @@ class BenchGroup(TyperGroup):
 
 
 class Grouped(TyperCommand):
-    """Options in groups."""
+    """Options in groups, and nothing else: a file is told which command takes it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0].endswith((".yaml", ".yml")):
+            with told(lambda: "interrupted"):
+                load_experiment(args[0], (), self.name)
+        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         group_of = {name: group for group, names in GROUPS.items() for name in names}
@@ -100,7 +101,7 @@ class Grouped(TyperCommand):
             record = parameter.get_help_record(ctx)
             if record is not None:
                 rows[group_of.get(parameter.name or "", "Options")].append(record)
-        for group, records in rows.items():
+        for group, records in ((g, r) for g, r in rows.items() if r):
             with formatter.section(group):
                 formatter.write_dl(records)
 
@@ -138,10 +139,10 @@ for group, command, *examples in (
     (app, capture, "capture rig_virtual.yaml", "capture rig.yaml --out frames.zarr --resume"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
 ):
-    layout = Grouped if command is reconstruct else None
-    # A schema is JSON.
-    printing = command if command is schema else with_output(command)
-    group.command(cls=layout, epilog=examples_text(*examples))(printing)
+    layout = Grouped if command in (reconstruct, check) else None
+    printing = command if command is schema else with_output(command)  # a schema is JSON
+    told_last = "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in examples)])
+    group.command(cls=layout, epilog=told_last)(printing)
 app.add_typer(bench, name="bench")
 app.add_typer(calibrate, name="calibrate")
 

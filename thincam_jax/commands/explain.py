@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from thincam_jax._core.text import spelled
 from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment
 from thincam_jax.commands.terminal import ConfigFile, Overrides, say, say_result, told
 
@@ -65,7 +66,9 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
         if isinstance(value, dict) or any(isinstance(one, (dict, list)) for one in inside):
             yield from _entries(value, (*location, key))
         else:
-            text = f"[{', '.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            text = (
+                f"[{', '.join(map(spelled, value))}]" if isinstance(value, list) else spelled(value)
+            )
             yield (*location, key), text
 
 

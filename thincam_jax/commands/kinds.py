@@ -52,7 +52,13 @@ KINDS = {
         *("refocus:build_refocus", "refocus:run_refocus"),
     ),
     "screen": Kind(
-        *("a see-through screen", "run", "screen.config:ScreenConfig", "explain:rays", ""),
+        *(
+            "a see-through screen",
+            "run",
+            "screen.config:ScreenConfig",
+            "explain:rays",
+            "sts_camera",
+        ),
         *("screen.run:build_screen", "screen.run:run_screen"),
     ),
     "design": Kind(
@@ -109,7 +115,7 @@ def load_experiment(
 
     kind = read_kind(path)
     if command is not None and kind.command != command:
-        raise ConfigError(f"{path}: kind: is {kind.noun}; give it to 'thincam {kind.command}'")
+        raise ConfigError(f"{path}: is {kind.noun}; give it to 'thincam {kind.command}'")
     return load_as(kind.part(kind.section), path, overrides)
 
 
@@ -139,15 +145,15 @@ def examples() -> list[str]:
     return [*_FILE_OF, *sorted(others)]
 
 
-def _source(kind: str) -> Path:
-    return _folder() / f"{_FILE_OF.get(kind, kind)}.yaml"
+def _source(example: str) -> Path:
+    return _folder() / f"{_FILE_OF.get(example, example)}.yaml"
 
 
 def init(
-    kind: Annotated[
+    example: Annotated[
         str | None, typer.Argument(help="Leave it out for a list of them.", autocompletion=examples)
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File, or folder; default KIND.yaml.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File, or folder; default EXAMPLE.yaml.")] = None,
 ) -> None:
     """Write an example experiment file to begin with; or list these."""
     with told(lambda: "interrupted"):
@@ -157,16 +163,17 @@ def init(
         from thincam_jax._core.table import Table
         from thincam_jax.commands.config_file import ConfigError, read_raw
 
-        if kind is None:
-            rows = [(one, read_raw(_source(one))[0]["title"]) for one in examples()]
-            show(Table(("kind", "experiment"), rows))
-            say("next: thincam init KIND")
+        if example is None:
+            raw = {one: read_raw(_source(one))[0] for one in examples()}
+            rows = [(one, r.get("kind", "study"), r["title"]) for one, r in raw.items()]
+            show(Table(("example", "kind", "experiment"), rows))
+            say("next: thincam init EXAMPLE")
             return
-        if kind not in examples():
-            raise ConfigError(f"init {kind}: choose one of {', '.join(examples())}")
+        if example not in (*examples(), *_FILE_OF.values()):
+            raise ConfigError(f"init {example}: choose one of {', '.join(examples())}")
         path = out or Path()
-        path = path / f"{kind}.yaml" if path.is_dir() else path
-        source = _source(kind)
+        path = path / f"{example}.yaml" if path.is_dir() else path
+        source = _source(example)
         text, command = source.read_text(encoding="utf-8"), read_kind(source).command
         # A copy may lie anywhere; its schema stays with the package that reads it.
         text = text.replace("$schema=", f"$schema={_folder().as_uri()}/", 1)

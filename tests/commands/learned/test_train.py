@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from commands.pages import assert_says_its_result
 from learn import tiny_network as tiny
 from typer.testing import CliRunner
 
@@ -63,7 +64,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     result = json.loads((out / "training.json").read_text("utf-8"))
     assert result["steps"] == 4 and len(result["losses"]) == 4 and result["skipped"] == 0
     assert result["trained"]["focus_psnr_db"] > 0 and result["linear"]["consistency"] > 0
-    page = (out / "report.html").read_text("utf-8")
+    page = assert_says_its_result(out)
     assert "drawn" in page and page.count("data:image/") == 4
     assert load(out / NETWORK, tiny.camera()).camera.planes == 2
     # The folder of a training is not begun anew by accident; what is finished stays as it is.
@@ -100,7 +101,7 @@ def test_a_fault_of_the_file_is_told(changed, told, file):
 
 def test_a_file_of_another_kind_is_told_as_that_alone():
     told = line(call(ROOT / "configs" / "fza_refocus.yaml"))
-    assert told.endswith("kind: is a refocusing; give it to 'thincam run'")
+    assert told.endswith(".yaml: is a refocusing; give it to 'thincam run'")
 
 
 def test_a_folder_that_is_not_there_is_told(file):
