@@ -3,9 +3,11 @@
 import base64
 import io
 import re
+import shutil
 
 import numpy as np
 import PIL.Image
+import pytest
 
 from thincam_jax._core.table import Table
 from thincam_jax.commands.report import Gallery, Page, Part, Picture, Sentences, render_report
@@ -88,3 +90,43 @@ def test_a_table_is_the_same_in_a_terminal(capsys):
     show(TABLE)
     shown = capsys.readouterr().out
     assert all(text in shown for text in ("method", "PSNR", "dB", "A <b>", "30.1", "29.0"))
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_page_is_read_in_light_and_dark_and_on_a_phone(tmp_path, scheme):
+    """Text stands out from its ground by what WCAG asks for, 7; and nothing is wider than 390."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium") or pytest.skip("chromium is not installed")
+    picture = Picture("psf.png", "A PSF", "Its caption.")
+    page = rendered(Page((picture, TABLE), (Part("PSF", ("T.",)),), result="A > B."), tmp_path)
+    (tmp_path / "report.html").write_text(page, "utf-8")
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        view = browser.new_page(color_scheme=scheme, viewport={"width": 390, "height": 900})
+        view.goto((tmp_path / "report.html").as_uri())
+        assert view.evaluate("document.documentElement.scrollWidth") <= 390
+        light = [
+            view.locator(one).first.evaluate(
+                """(one, name) => {
+                    const context = new OffscreenCanvas(1, 1).getContext("2d");
+                    context.fillStyle = getComputedStyle(one)[name];
+                    context.fillRect(0, 0, 1, 1);
+                    const linear = (v) => v <= 10 ? v / 3294 : ((v / 255 + 0.055) / 1.055) ** 2.4;
+                    const [r, g, b] = [...context.getImageData(0, 0, 1, 1).data].map(linear);
+                    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+                }""",
+                name,
+            )
+            for one, name in (
+                ("body", "backgroundColor"),
+                (".result", "color"),
+                ("figcaption", "color"),
+                (".published", "color"),
+            )
+        ]
+        browser.close()
+    ground, *texts = light
+    assert ground < 0.05 if scheme == "dark" else ground > 0.9
+    for text in texts:
+        low, high = sorted((ground, text))
+        assert (high + 0.05) / (low + 0.05) > 7

@@ -174,22 +174,19 @@ def _sweep_metrics(result: RefocusResult) -> dict[str, Any]:
 
 def page(config: RefocusConfig, result: RefocusResult) -> Page:
     """The page of a finished run."""
+    first, *others = result.findings()
     lead = f"{pixels_of(config.sensor)}, mask {config.mask.label}, {optics_of(config)}"
     curves = (
         f"Focus measure of each object in the sweep by {config.sweep.method}; vertical lines: "
         "where the objects were placed."
     )
     sweep = (
-        Picture("sweep.png", "Contact sheet of the sweep", _SWEEP),
-        Picture("sweep.webp", "Animation of the sweep", "The whole sweep, there and back."),
+        Picture("sweep.png", "The scene focused on distances", _SWEEP),
+        Picture("sweep.webp", "The scene refocused", "The whole sweep, there and back."),
     )
     depth = Picture("depth.png", "Depth map, confidence, all in focus", _DEPTH)
     methods = Picture("methods.png", "All methods at all distances", _METHODS)
-    found = (
-        result.table(),
-        Sentences(result.findings()),
-        Picture("focus.png", "Focus curves", curves),
-    )
+    found = (result.table(), Sentences(others), Picture("focus.png", "Focus curves", curves))
     parts = (
         Part("Distances", found),
         Part("Sweep", sweep),
@@ -197,4 +194,4 @@ def page(config: RefocusConfig, result: RefocusResult) -> Page:
         Part("Methods", (result.methods_table(), _SCORED, methods)),
         Part("Notes", config.notes),
     )
-    return Page((lead,), parts, warnings=result.refocusing.study.warnings)
+    return Page((lead,), parts, "run", result.refocusing.study.warnings, first)

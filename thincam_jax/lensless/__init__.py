@@ -1,4 +1,3 @@
 """The lensless camera: a coded mask at a distance in front of a sensor."""
 
-from thincam_jax.lensless.light import light_over_field as light_over_field
 from thincam_jax.lensless.light import shading as shading

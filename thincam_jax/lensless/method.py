@@ -58,11 +58,8 @@ class AccuracyWarning(UserWarning):
     import warnings
 
     import thincam_jax as tc
-    from thincam_jax.units import nm, um
 
-    camera = tc.LenslessCamera(tc.random_cells(0, 0.9, 30 * um), tc.Sensor((24, 32), 50 * um), 5.0)
-    with warnings.catch_warnings(action="ignore", category=tc.AccuracyWarning):
-        h = tc.psf(camera, wavelength=500 * nm, pixel_integration=True)
+    warnings.simplefilter("ignore", tc.AccuracyWarning)
     ```
 
     **See also**: `PsfMethod`, `SamplingWarning`.

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from thincam_jax.plot.frame import drawing
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.plot.frame import drawing, show_image
 
 _BESIDE = 4
 
@@ -64,22 +63,18 @@ def _stack(images, labels, pitch, levels, words) -> Figure:
 
 
 def draw_images(
-    images: Mapping[str, Reconstruction], scores: Mapping[str, float | None] | None = None
+    images: Mapping[str, Float[np.ndarray, "y x"]], pitch: float, scores: Mapping[str, float | None]
 ) -> Figure:
-    """Reconstructions (y, x) on the object, each from its own black to its own white.
+    """Images on the object, each from its own black to its own white.
 
-    - `scores`: PSNR of each, dB, by its name.
+    - `pitch`: of their pixels, mm. `scores`: PSNR, dB, by their names, of those that have one.
     """
     figure, axes = drawing((4.2 * len(images), 4.7), 1, len(images), squeeze=False)
-    for ax, (name, one) in zip(axes[0], images.items(), strict=True):
-        image = np.squeeze(np.asarray(one.image, float))
-        low, high = np.quantile(image, (0.002, 0.998))
-        half = [n * float(np.asarray(one.pitch)) / 2 for n in image.shape]
-        extent = (-half[1], half[1], half[0], -half[0])
-        ax.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent)
-        score = None if scores is None else scores.get(name)
+    for ax, (name, image) in zip(axes[0], images.items(), strict=True):
+        show_image(ax, stretched(image), pitch, vmin=0, vmax=1)
+        score = scores.get(name)
         ax.set_title(name if score is None else f"{name}, {score:.1f} dB", fontsize=10)
-        ax.set_xlabel("x on the object (mm)")
+        ax.set(xlabel="x on the object (mm)", ylabel="")
     axes[0, 0].set_ylabel("y on the object (mm)")
     return figure
 

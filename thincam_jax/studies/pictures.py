@@ -82,6 +82,14 @@ def reconstructed(
     return Reconstructed(images, MethodScores(*means, found.status, found.iterations, of_targets))
 
 
+def finding(methods: Mapping[str, Reconstructed]) -> str:
+    """How near the last method comes, in a sentence."""
+    name, one = list(methods.items())[-1]
+    mean, count = one.scores.mean_psnr_db, len(one.scores.targets)
+    near = "exactly" if mean is None else f"at {mean:.1f} dB on average"
+    return f"{name} reconstructs {count} picture{'s' * (count > 1)} {near}."
+
+
 @dataclass(frozen=True)
 class PublishedImage:
     """Figures that a publication gives for a target and a solver; None where it gives none."""

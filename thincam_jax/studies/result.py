@@ -211,7 +211,8 @@ def _main_result(study: Study, scores: StudyScores) -> list[str]:
     names = [name for name in scores.methods if name in conventional] or [*scores.methods][:1]
     others = [name for name in scores.methods if name not in names]
     if not others:
-        return []
+        target, found = next(iter(scores.methods[names[0]].targets.items()))
+        return [f"{names[0]} on {target}: {found.words}."]
     before, after = (
         min(group, key=lambda name: _rank(scores.methods[name])) for group in (names, others)
     )

@@ -129,12 +129,17 @@ class FrameAgreement:
     frame_bias_over_noise: list[float]
     image_noise_over_simulated: float
 
+    def __str__(self) -> str:
+        worst, image = max(self.frame_residual_over_noise), self.image_noise_over_simulated
+        frames = f"Beside a direct simulation frames differ by {worst:.2f} times their noise"
+        return f"{frames}; the image has {image:.2f} times the noise of a simulated one."
+
 
 @dataclass(frozen=True, eq=False)
 class FrameComparison:
-    """Images "captured", "simulated" and "without noise", their PSNR, dB, and the agreement."""
+    """Images "scene", "captured", "simulated" and "without noise", PSNR, dB, and the agreement."""
 
-    images: dict[str, Reconstruction]
+    images: dict[str, Float[np.ndarray, "y x"]]
     psnr_db: dict[str, float | None]
     agreement: FrameAgreement
 
@@ -172,19 +177,19 @@ def compare_frames(
         frames = noise * frames + clean + camera.offset
         return solve(frames.astype(np.float32))
 
-    images = {"captured": captured}
-    images |= {"simulated": simulated(1.0), "without noise": simulated(0.0)}
+    images = {"captured": captured, "simulated": simulated(1.0), "without noise": simulated(0.0)}
     pixels = {name: np.squeeze(np.asarray(one.image, float)) for name, one in images.items()}
     grid = Grid(pixels["captured"].shape, jnp.asarray(captured.pitch))
     truth = np.asarray(sample(target.plane, grid), float)
     scores = {name: rounded(psnr(image, truth)) for name, image in pixels.items()}
+    pixels = {"scene": truth} | pixels
     noise = [np.std(pixels[n] - pixels["without noise"]) for n in ("captured", "simulated")]
     agreement = FrameAgreement(
         [round(float(np.std(z)), 4) for z in of_each],
         [round(float(np.mean(z)), 4) for z in of_each],
         round(float(noise[0] / noise[1]), 4),
     )
-    return FrameComparison(images, scores, agreement)
+    return FrameComparison(pixels, scores, agreement)
 
 
 def monitor_system(
@@ -213,6 +218,10 @@ class MatrixAgreement:
     matrix_residual_over_noise: float
     largest_counts: float
     noise_counts: float
+
+    def __str__(self) -> str:
+        found = self.matrix_residual_over_noise
+        return f"The matrix differs from the exact one by {found:.2f} times its noise."
 
 
 @dataclass(frozen=True, eq=False)

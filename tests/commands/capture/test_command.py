@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from commands.capture import tiny
+from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 
 from helpers import ROOT, read_fiducial, recipe
@@ -63,7 +64,9 @@ def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
     scores = found["psnr_db"]
     assert abs(scores["captured"] - scores["simulated"]) < 1.5
     assert scores["captured"] > 17
-    assert (tmp_path / "out" / "report.html").read_text("utf-8").count("data:image/webp") == 4
+    page = assert_says_its_result(tmp_path / "out")
+    assert page.count("data:image/webp") == 4 and "frames differ by 1.0" in page
+    assert (tmp_path / "out/images/scene.png").exists()
 
 
 @pytest.mark.thorough

@@ -9,6 +9,7 @@ import pytest
 import skimage.io
 import yaml
 from commands.capture import tiny
+from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 
 PICTURES = yaml.safe_load(tiny.HADAMARD) | {
@@ -53,7 +54,7 @@ def test_pictures_come_back(home):
         assert of_targets["turned"]["psnr_db"] > 22
     image = skimage.io.imread(home / "found/images/bars--tv.png")
     assert image[3, 4] > image[3, 11] > image[0, 0]
-    page = (home / "found/report.html").read_text("utf-8")
+    page = assert_says_its_result(home / "found")
     assert "Beside what was published" in page and "turned" in page
     again = call("run", "pictures.zarr", "--out", "again", "--set", "matrix=found/matrix.zarr")
     assert again.exit_code != 0  # a store has its own file

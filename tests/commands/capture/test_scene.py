@@ -7,6 +7,7 @@ import pytest
 import tifffile
 import yaml
 from commands.capture import tiny
+from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 
 from thincam_jax.commands.capture.command import build_plan
@@ -45,7 +46,7 @@ def test_merged_frames_are_those_of_a_direct_simulation(file):
     assert abs(bias) < 0.15  # by chance 0.013, and the display's 8 bits: 6e-4 of the light
     frame, variance = (tifffile.imread(out / f"{name}.tif") for name in ("scene", "variance"))
     assert frame.shape == variance.shape == (64, 96) and np.isfinite(variance).all()
-    assert "exposure 5, 50 ms" in (out / "report.html").read_text("utf-8")
+    assert "exposure 5, 50 ms" in assert_says_its_result(out)
 
 
 def test_a_real_scene_needs_neither_display_nor_optics(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import skimage.io
 from commands.design import tiny
+from commands.pages import assert_says_its_result
 from commands.study.tiny import Told
 from commands.test_cli import call
 
@@ -127,7 +128,7 @@ def test_found_study_gives_the_first_seed(whole):
 
 def test_report_stands_alone(whole):
     path, design, _ = whole
-    page = (path / "report.html").read_text("utf-8")
+    page = assert_says_its_result(path)
     assert page.count("data:image/webp;base64,") == 6
     assert "A tiny design" in page
     psnr = design.validation.methods["pairs"]["picture"].psnr_db

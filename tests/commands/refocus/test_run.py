@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 import PIL.Image
 import pytest
+from commands.pages import assert_says_its_result
 from commands.refocus import tiny
 from commands.study.tiny import Told
 from studies import tiny_refocus
@@ -68,7 +69,7 @@ def test_animation_goes_there_and_back(run):
 
 
 def test_report_stands_alone_and_is_escaped(run):
-    page = (run[1] / "report.html").read_text("utf-8")
+    page = assert_says_its_result(run[1])
     sources = re.findall(r'src="([^"]+)"', page)
     assert len(sources) == 5
     assert all(source.startswith("data:image/") for source in sources)

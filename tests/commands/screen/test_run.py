@@ -7,6 +7,7 @@ from dataclasses import asdict
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands.pages import assert_says_its_result
 from commands.screen import tiny
 from commands.study.tiny import Told
 from studies import tiny_screen
@@ -98,7 +99,7 @@ def test_progress_and_files(run):
 
 @pytest.mark.thorough
 def test_report_stands_alone_and_is_escaped(run):
-    page = (run[1] / "report.html").read_text("utf-8")
+    page = assert_says_its_result(run[1])
     sources = re.findall(r'src="([^"]+)"', page)
     assert len(sources) == len(PICTURES)
     assert all(source.startswith("data:image/") for source in sources)

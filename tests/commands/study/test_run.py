@@ -13,6 +13,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import skimage.io
+from commands.pages import assert_says_its_result
 from commands.study import tiny
 from commands.sweep import mini
 from commands.test_cli import call
@@ -333,8 +334,7 @@ def run(whole, tmp_path):
     """Study, folder, scores and report of a copy of the run."""
     study, path, scores, _ = whole
     shutil.copytree(path, tmp_path / "copy")
-    page = (path / "report.html").read_text("utf-8")
-    return study, RunFolder(tmp_path / "copy"), scores, page
+    return study, RunFolder(tmp_path / "copy"), scores, assert_says_its_result(path)
 
 
 def rendered(config, folder, scores):

@@ -24,7 +24,7 @@ from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import write_image
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
-from thincam_jax.studies.pictures import beside
+from thincam_jax.studies.pictures import beside, finding
 from thincam_jax.studies.rig import (
     FrameAgreement,
     MatrixAgreement,
@@ -81,6 +81,7 @@ class _CaptureRun(Run):
         super().__init__(config, folder)
         self.taken = taken
         self.agreement: FrameAgreement | MatrixAgreement | None = None
+        self.found = f"{len(taken.labels)} frames, at most {taken.seen.frames.max():.0f} counts."
         self.table: Table | None = None  # of pictures
         self.metrics |= {
             "study": config.name,
@@ -103,7 +104,8 @@ class _CaptureRun(Run):
     def report(self) -> None:
         if self.agreement is not None:
             self.metrics["agreement"] = asdict(self.agreement)
-        self.complete(page(self.config, self.taken, self.agreement, self.table))
+            self.found = str(self.agreement)
+        self.complete(page(self.config, self.taken, self.agreement, self.table, self.found))
 
     def show(self) -> None:
         taken, config, folder, seen = self.taken, self.config, self.folder, self.taken.seen
@@ -124,18 +126,18 @@ class _CaptureRun(Run):
         study = build_study(config, (seen.frames.shape[1], seen.frames.shape[2]))
         solve = frame_solver(study, study.config.object.width)
         captured = solve(seen.frames)
-        images, scores = {"captured": captured}, {}
+        images, scores = {"captured": np.squeeze(np.asarray(captured.image, float))}, {}
         if seen.camera is not None and config.virtual is not None:
             whole = build_study(config, config.virtual.sensor)
             found = compare_frames(whole, seen, solve, captured, config.seed)
             images, scores, self.agreement = found.images, found.psnr_db, found.agreement
             self.metrics["psnr_db"] = scores
-        self.folder.save_figure("images", plot.draw_images(images, scores))
-        for name, one in images.items():
-            image = plot.stretched(np.squeeze(np.asarray(one.image, float)))
-            self.folder.save_image(name.replace(" ", "-"), image)
+        pitch = float(np.asarray(captured.pitch))
+        self.folder.save_figure("images", plot.draw_images(images, pitch, scores))
+        for name, image in images.items():
+            self.folder.save_image(name.replace(" ", "-"), plot.stretched(image))
         self.metrics["status"] = captured.status
-        self.metrics["object_pixel_mm"] = float(np.asarray(captured.pitch))
+        self.metrics["object_pixel_mm"] = pitch
 
     def look(self) -> None:
         """The pictures, by the matrix of a calibration."""
@@ -153,6 +155,7 @@ class _CaptureRun(Run):
             for target, image in zip(found.targets, one.images, strict=True):
                 self.folder.save_image(f"{slug(target)}--{slug(name)}", image)
         self.metrics["methods"] = {name: asdict(one.scores) for name, one in found.methods.items()}
+        self.found = finding(found.methods)
         self.table = beside(found.methods, published_figures(config.targets))
 
     def linearise(self) -> None:
@@ -249,10 +252,11 @@ def page(
     config: CaptureConfig,
     taken: Taken,
     agreement: FrameAgreement | MatrixAgreement | None,
-    table: Table | None = None,
+    table: Table | None,
+    result: str,
 ) -> Page:
-    """The page of a finished run."""
-    beside_it = ", beside that of a direct simulation with other noise, and without"
+    """The page of a finished run; `result`: in a sentence."""
+    beside_it = ", beside the scene and a direct simulation with other noise, and without"
     images = f"What is reconstructed{beside_it if agreement else ''}."
     seen = "What the sensor sees of single cells (row, column)"
     seen += ": measured, and by direct simulation. " if agreement else ". "
@@ -273,7 +277,5 @@ def page(
     parts = [compared] if rows else []
     parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
     if taken.seconds:
-        time = Picture("seconds.png", "Time of the steps", "Time of all frames, by step.")
-        parts.append(Part("Time", (time,)))
-    parts += [Part("Notes", config.notes)] if config.notes else []
-    return Page(lead, parts)
+        parts += [Part("Time", (Picture("seconds.png", "Time of the steps", "Of all frames."),))]
+    return Page(lead, [*parts, Part("Notes", config.notes)], result=result)

@@ -37,6 +37,7 @@ def page(config: DesignConfig, design: DesignScores) -> Page:
     else:
         noise = f"{config.noise.electrons:g} electrons a mm² of open aperture and "
         noise += f"{config.noise.read_noise:g} of read noise"
+    first, *others = design.findings()
     prior = number(design.objective.prior_exponent, 2)
     measured = ", as measured on the pictures" if config.prior.measured else ""
     lead = (
@@ -44,7 +45,7 @@ def page(config: DesignConfig, design: DesignScores) -> Page:
         f"{config.object.width:g} mm wide at {config.object.distance:g} mm, {light}, {noise}, "
         f"synthesis `{config.reference.synthesis}`. The scene's spectrum falls with the power "
         f"{prior} of frequency{measured}. Seed {config.seed}.",
-        Sentences(design.findings()),
+        Sentences(others),
         *config.notes,
     )
     reference = design.reference.name
@@ -72,7 +73,7 @@ def page(config: DesignConfig, design: DesignScores) -> Page:
         Part("Simulated", (design.validation.table(), simulated)),
         Part("Pareto fronts", pareto),
     )
-    return Page(lead, parts, command="design", warnings=design.warnings)
+    return Page(lead, parts, "design", design.warnings, first)
 
 
 def _images(config: DesignConfig, design: DesignScores) -> list[Picture]:

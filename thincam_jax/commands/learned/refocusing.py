@@ -119,10 +119,8 @@ def run_training(config: LearnedConfig, place: InFolder) -> Ended:
     folder.save_figure("sweep", draw_sweep(sweep))
     folder.write("figures/sweep.webp", animate_sweep(sweep))
     folder.complete(page(config, lessons, result), config, metrics, started)
-    after, before = result.scores.focus_psnr_db, result.linear.focus_psnr_db
-    line = f"focused images have {after:.2f} dB, the linear start {before:.2f} dB"
     path = folder.path
-    return Ended(f"{trained.status}: {line}", path / NETWORK, path / "report.html")
+    return Ended(f"{trained.status}: {result.finding()}", path / NETWORK, path / "report.html")
 
 
 def build_camera(config: LearnedConfig) -> RefocusCamera:
@@ -178,13 +176,13 @@ def page(config: LearnedConfig, lessons: Lessons, result: RefocusTraining) -> Pa
         "Of the scenes of the checks, each with its own noise and commanded distance.",
     )
     sweep = (
-        Picture("sweep.png", "Contact sheet of the sweep", _SWEEP),
-        Picture("sweep.webp", "Animation of the sweep"),
+        Picture("sweep.png", "One capture, focused on distances", _SWEEP),
+        Picture("sweep.webp", "One capture, focused nearer and farther"),
     )
     training = (
         f"{state.step} steps, {state.skipped} skipped, {state.retreats} times back at half the "
         f"rate: {trained.status}.",
-        Picture("loss.png", "Loss"),
+        Picture("loss.png", "Loss of the training"),
     )
     scenes = Picture("scenes.png", "Scenes and what the network makes of them", _SCENES)
     warnings = ()
@@ -197,4 +195,4 @@ def page(config: LearnedConfig, lessons: Lessons, result: RefocusTraining) -> Pa
         Part("Training", training),
         Part("Images", (lessons.images_table(), *config.notes)),
     )
-    return Page((lead,), parts, command="train", warnings=warnings)
+    return Page((lead,), parts, "train", warnings, f"After training, {result.finding()}.")

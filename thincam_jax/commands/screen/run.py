@@ -23,6 +23,7 @@ from thincam_jax.commands.sections import VariationConfig
 from thincam_jax.commands.study.build import picture
 from thincam_jax.plot import screen as plot
 from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
+from thincam_jax.studies.pictures import finding
 from thincam_jax.studies.screen import (
     ModelResult,
     RaySummary,
@@ -233,7 +234,7 @@ def page(
         Part("Calibration with Hadamard patterns", calibrated, "Calibration"),
         Part("Notes", config.notes),
     )
-    return Page(lead, parts)
+    return Page(lead, parts, result=finding(result.right.methods))
 
 
 def _calibration(

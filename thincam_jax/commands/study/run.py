@@ -149,6 +149,7 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
         Picture("mtf.png", "Transfer functions of all methods", _TRANSFER),
         Picture("contrast.png", "Contrast of chart elements", _CONTRAST),
     )
+    psf = (Picture("psf.png", "Point spread function", "Of the first capture."),)
     published = (Sentences(sentences), *config.notes) if sentences or config.notes else ()
     parts = (
         Part("Other reconstructions", [picture for pictures in others for picture in pictures]),
@@ -156,10 +157,7 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
         Part("Resolution", (scores.resolution_table(), _RESOLVED)),
         Part("Beside the published figures", published),
         Part("Transfer functions", transfer),
-        Part(
-            "Point spread function",
-            (Picture("psf.png", "Point spread function", "Of the first capture."),),
-        ),
+        Part("Point spread function", psf),
     )
     result, *sentences = sentences or [""]
     beginning = (*first, scores.table(), lead)
@@ -170,7 +168,7 @@ def _pictures(target: str, scores: StudyScores) -> tuple[Gallery, Gallery, Pictu
     """Of a target: whole, enlarged, and all captures, folded."""
     place = f"../images/{slug(target)}--"
     wholes = [
-        Picture(f"{place}capture.png", f"First raw capture of {target}", "first raw capture"),
+        Picture(f"{place}capture.png", f"{target} as shadows of the mask", "first raw capture"),
         Picture(f"{place}scene.png", target, f"{target}, the scene"),
     ]
     details = [Picture(f"{place}scene--detail.png", f"Part of {target}", "scene, enlarged")]

@@ -47,7 +47,7 @@ class Pattern:
     def label(self) -> str:
         """In a figure's title: β and φ of a mask, the number of a Hadamard frame."""
         if self.kind == "fza":
-            return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f}"
+            return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f} rad"
         if self.kind == "picture":
             return str(self.numbers["name"])
         if self.kind == "uniform":

@@ -60,6 +60,11 @@ class RefocusTraining:
         both = (f"{name}\n{score}" for name in names for score in ("PSNR dB", "SSIM"))
         return Table(("network", *both, "residual\nover noise"), rows, (2, 3, 2, 3, 2))
 
+    def finding(self) -> str:
+        """What the training gains, in words."""
+        after, before = self.scores.focus_psnr_db, self.linear.focus_psnr_db
+        return f"focused images have {after:.2f} dB, the linear start {before:.2f} dB"
+
     def sweep(self) -> RefocusSweep:
         """The batch's first capture, focused on distances even in 1/t, upright."""
         network, batch = self.network, self.batch
