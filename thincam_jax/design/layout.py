@@ -181,7 +181,7 @@ def _shortest(lines: np.ndarray, edges: np.ndarray) -> float:
 
 
 def _binary(values: np.ndarray) -> np.ndarray:
-    found = np.round(values.real)
+    found = np.round(np.real(values))
     if np.abs(values - found).max() > 1e-6 or not np.isin(found, (0, 1)).all():
         raise ValueError("the mask has grey or complex parts; give transmittances of 0 and 1")
     return found
