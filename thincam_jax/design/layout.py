@@ -1,5 +1,6 @@
 """Layouts of binary masks for lithography, as GDSII files."""
 
+import math
 import os
 import tempfile
 from pathlib import Path
@@ -120,7 +121,7 @@ def _zones(mask: AbstractMask) -> tuple[np.ndarray, bool] | None:
 
 def _rings(gdstk: Any, mask: AbstractMask, radii: np.ndarray, middle: bool) -> tuple[list, float]:
     y, x = _centre(mask)
-    edges = np.concatenate([[0.0], radii, [np.hypot(*(float(s) for s in mask.extent))]])
+    edges = np.concatenate([[0.0], radii, [math.hypot(*map(float, mask.extent))]])
     rings = [
         gdstk.ellipse(
             (x, y),

@@ -1,8 +1,9 @@
 """Studies in memory: exposures, simulation, evaluation and responses of whole methods."""
 
+from typing import TYPE_CHECKING
+
 from thincam_jax.lensless.exposures import Exposure as Exposure
 from thincam_jax.lensless.exposures import Exposures as Exposures
-from thincam_jax.studies.design import DesignStudy as DesignStudy
 from thincam_jax.studies.evaluate import Evaluation as Evaluation
 from thincam_jax.studies.evaluate import Resolved as Resolved
 from thincam_jax.studies.evaluate import Scores as Scores
@@ -39,3 +40,19 @@ from thincam_jax.studies.study import Published as Published
 from thincam_jax.studies.study import Study as Study
 from thincam_jax.studies.study import Target as Target
 from thincam_jax.studies.thesis import superresolution as superresolution
+
+if TYPE_CHECKING:
+    from thincam_jax.studies.design import DesignStudy as DesignStudy
+
+
+def __getattr__(name: str):
+    # Other studies need nothing of the room of designs.
+    if name == "DesignStudy":
+        from thincam_jax.studies.design import DesignStudy
+
+        return DesignStudy
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted((*globals(), "DesignStudy"))
