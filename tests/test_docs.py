@@ -5,6 +5,8 @@ import json
 import os
 import re
 import runpy
+import shlex
+import tomllib
 from pathlib import PurePosixPath
 
 import jax
@@ -13,11 +15,14 @@ import numpy as np
 import PIL.Image
 import pytest
 import skimage.data
+import typer
+import yaml
 from commands.reconstruct import simulated
 
 import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax import learn
+from thincam_jax.commands import cli
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
@@ -303,6 +308,69 @@ def test_screen_calibration_page(tmp_path, monkeypatch):
     assert abs(float(error)) < 4 * float(fit.standard_errors["glass_thickness"])
     assert fit.status == "ok"
     np.testing.assert_allclose(names["image"], 1, atol=0.02)
+
+
+def blocks(*kinds: str) -> list[tuple[str, str]]:
+    """Page and text of each block of a kind; those without one are ""."""
+    named = "|".join(kinds)
+    return [
+        (page, text)
+        for page, whole in pages().items()
+        for _, kind, text in re.findall(r"^(```)(\w*)\n(.*?)^```", whole, re.MULTILINE | re.DOTALL)
+        if re.fullmatch(named, kind)
+    ]
+
+
+# The shipped file into which a section of a page fits.
+FITS = {"mask": "mura", "object": "moving", "plan": "rig_scene", "methods": "fza_harmonics"}
+
+
+def sections():
+    """Page, key and value of each section in YAML; a list is one of methods."""
+    for page, text in blocks("yaml"):
+        # A block shows several sections of a key below each other.
+        for part in re.split(r"^(?=\w)", text, flags=re.MULTILINE):
+            found = yaml.safe_load(part)
+            found = {"methods": found} if isinstance(found, list) else found or {}
+            for key, value in found.items():
+                yield pytest.param(key, value, id=f"{page}: {key}")
+
+
+@pytest.mark.parametrize(("key", "value"), list(sections()))
+def test_a_section_of_a_page_fits_into_an_experiment(key, value):
+    """In place of the file's own; a plan changes the entries that it names."""
+    entries = (
+        {f"plan.{name}": one for name, one in value.items()} if key == "plan" else {key: value}
+    )
+    overrides = tuple(f"{path}={json.dumps(one)}" for path, one in entries.items())
+    config = load_experiment(ROOT / f"configs/{FITS[key]}.yaml", overrides, None)
+    assert getattr(config, key)
+
+
+@pytest.mark.parametrize("text", [text for _, text in blocks("toml")])
+def test_what_a_page_shows_of_a_project_file_can_be_read(text):
+    (groups,) = tomllib.loads(text)["project"].values()
+    assert all(group.startswith("thincam_jax.") for group in groups)
+
+
+def command_lines():
+    """Page and words of each call of the command in a page."""
+    for page, text in blocks("sh", ""):
+        lines = text.replace("\\\n", " ").replace("; thincam", "\nthincam").splitlines()
+        for line in lines:
+            if line.split("/")[-1].startswith("thincam "):
+                yield pytest.param(shlex.split(line, comments=True)[1:], id=f"{page}: {line}")
+
+
+@pytest.mark.parametrize("words", list(command_lines()))
+def test_a_command_of_a_page_has_these_options_and_files(words):
+    command = typer.main.get_command(cli.app)
+    while hasattr(command, "commands"):
+        command, words = command.commands[words[0]], words[1:]
+    known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
+    given = {word.strip("[]").split("=")[0] for word in words if re.match(r"\[?--", word)}
+    assert given <= known
+    assert all((ROOT / word).is_file() for word in words if word.startswith("configs/"))
 
 
 def assigned(name: str) -> ast.expr:

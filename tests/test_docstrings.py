@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import doctest
 import inspect
 import io
 import re
@@ -56,3 +57,11 @@ def test_an_example_runs_and_prints_what_it_says(code, monkeypatch, tmp_path):
     plt.close("all")
     quoted = re.findall(r"^print\(.*\)  # (.*)$", code, re.MULTILINE)
     assert not quoted or quoted == printed.getvalue().splitlines()
+
+
+def test_the_example_of_the_package_prints_what_it_says():
+    """That of `help(thincam_jax)`, which is no block."""
+    test = doctest.DocTestParser().get_doctest(tc.__doc__, {}, "thincam_jax", None, None)
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):
+        found = doctest.DocTestRunner().run(test)
+    assert found.attempted == 5 and not found.failed
