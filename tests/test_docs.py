@@ -316,7 +316,7 @@ def blocks(*kinds: str) -> list[tuple[str, str]]:
     return [
         (page, text)
         for page, whole in pages().items()
-        for _, kind, text in re.findall(r"^(```)(\w*)\n(.*?)^```", whole, re.MULTILINE | re.DOTALL)
+        for kind, text in re.findall(r"^```(.*?)\n(.*?)^```", whole, re.MULTILINE | re.DOTALL)
         if re.fullmatch(named, kind)
     ]
 
@@ -358,7 +358,7 @@ def command_lines():
     for page, text in blocks("sh", ""):
         lines = text.replace("\\\n", " ").replace("; thincam", "\nthincam").splitlines()
         for line in lines:
-            if line.split("/")[-1].startswith("thincam "):
+            if re.match(r"(\S*/)?thincam ", line):
                 yield pytest.param(shlex.split(line, comments=True)[1:], id=f"{page}: {line}")
 
 
