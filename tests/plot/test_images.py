@@ -9,6 +9,8 @@ import pytest
 import skimage.io
 
 import thincam_jax as tc
+from thincam_jax.plot.frame import as_png
+from thincam_jax.plot.images import draw_result
 from thincam_jax.reconstruction import Reconstruction
 
 matplotlib.use("Agg")
@@ -42,22 +44,40 @@ def test_images_are_compared_with_the_truth():
 
 
 @pytest.mark.parametrize(
-    ("shape", "pitch", "shown"),
+    ("shape", "pitch", "shown", "widths"),
     [
-        ((9, 13), None, (9, 13)),
-        ((3, 9, 13), 0.1, (9, 13, 3)),  # colours
-        ((3, 9, 13), [0.1, 0.2, 0.3], (9, 39)),  # planes
-        ((2, 9, 13), None, (9, 26)),
+        ((9, 13), None, (9, 13), [None]),
+        ((3, 9, 13), 0.1, (9, 13, 3), [1.3]),  # colours
+        ((3, 9, 13), [0.1, 0.2, 0.3], (9, 13), [1.3, 2.6, 3.9]),  # planes
+        ((2, 9, 13), 0.1, (9, 13), [1.3, 1.3]),
+        ((20, 9, 13), None, (9, 13), [None] * 16),
     ],
 )
-def test_a_result_shows_itself(shape, pitch, shown):
+def test_a_result_shows_itself_on_axes(shape, pitch, shown, widths):
     linear = RNG.uniform(size=shape)
-    picture = skimage.io.imread(io.BytesIO(result(linear, pitch)._repr_png_()))
-    assert picture.shape == shown
-    assert picture.max() == 255
-    first = linear[0] if len(shown) == 2 and len(shape) == 3 else linear
-    part = picture[:, :13] if len(shown) == 2 else np.moveaxis(picture, -1, 0)
-    assert np.corrcoef(first.ravel() ** (1 / 2.2), part.ravel())[0, 1] > 0.99
+    found = result(linear, pitch)
+    figure = draw_result(found)
+    for ax, width in zip(figure.axes, widths, strict=True):
+        image = ax.images[0]
+        assert image.get_array().shape == shown and ax.axison
+        assert ax.get_xlabel() == ("x (mm)" if width else "x (pixels)")
+        assert not width or np.ptp(image.get_extent()[:2]) == pytest.approx(width)
+    first = linear[0] if len(widths) > 1 else np.moveaxis(linear, 0, -1 if len(shape) > 2 else 0)
+    levels = np.asarray(figure.axes[0].images[0].get_array())
+    assert np.corrcoef(first.ravel() ** (1 / 2.2), levels.ravel())[0, 1] > 0.99
+    assert 5 <= figure.get_figwidth() <= 10 and figure.get_suptitle()[:18] == (
+        "the first 16 of 20" if shape[0] == 20 else ""
+    )
+
+
+def test_a_notebook_gets_the_figure_of_a_result_and_none_stays_open():
+    from matplotlib import pyplot
+
+    found = result(IMAGE, 0.1)
+    shown = found._repr_png_()
+    assert shown == as_png(draw_result(found)) and not pyplot.get_fignums()
+    height, width, _ = skimage.io.imread(io.BytesIO(shown)).shape
+    assert width == 550 and 350 < height < 500  # 5 inches
 
 
 def test_a_result_that_is_not_finite_is_shown_too():

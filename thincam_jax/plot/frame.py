@@ -39,17 +39,18 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def show_image(axes: Axes, image: Any, pitch: float, **options: Any) -> AxesImage:
+def show_image(axes: Axes, image: Any, pitch: float | None, **options: Any) -> AxesImage:
     """Draw an image (y, x) or (y, x, 3) on axes in mm about its middle, +y down.
 
-    - `pitch`: distance of its pixels, mm.
+    - `pitch`: distance of its pixels, mm; None: axes count pixels.
     - `options`: of `matplotlib.axes.Axes.imshow`.
     """
     image = np.asarray(image)
-    rows, columns = (n * pitch / 2 for n in image.shape[:2])
-    extent = (-columns, columns, rows, -rows)
+    rows, columns = (n * (pitch or 1) / 2 for n in image.shape[:2])
+    extent = (-columns, columns, rows, -rows) if pitch else None
     shown = axes.imshow(image, extent=extent, **{"cmap": "gray", **options})
-    axes.set(xlabel="x (mm)", ylabel="y (mm)")
+    unit = "mm" if pitch else "pixels"
+    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     return shown
 
 

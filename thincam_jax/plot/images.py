@@ -1,16 +1,20 @@
 """Figures of images: a capture, and reconstructions beside each other."""
 
 from collections.abc import Mapping
+from itertools import cycle
 from typing import Any
 
+import matplotlib.figure
 import numpy as np
 
 from thincam_jax._core.checks import Number, pixel_pitch
 from thincam_jax.imaging.display import eight_bit, pictures
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.plot.frame import Figure, new_figure, show_image
+from thincam_jax.plot.frame import Figure, new_figure, sheet, show_image
 from thincam_jax.reconstruction import Reconstruction
+
+_BESIDE, _MOST = 4, 16  # images in a row, and in all, that a result shows of itself
 
 
 def capture(image: Any, sensor: Sensor | Number) -> Figure:
@@ -72,6 +76,24 @@ def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
             target = arrays[truth]
             title += f", {psnr(image, target, float(np.ptp(target))):.1f} dB"
         ax.set_title(title, fontsize=9)
+    return figure
+
+
+def draw_result(result: Reconstruction) -> matplotlib.figure.Figure:
+    """A reconstruction on axes in mm on the object, or in pixels where its pitch is unknown.
+
+    Of a batch and of planes the first images, beside each other and with one white.
+    """
+    every = pictures(result.image, planes=result.has_planes)
+    images = every[:_MOST]
+    pitches = [None] if result.pitch is None else np.ravel(result.pitch).tolist()
+    aspect = np.clip(images[0].shape[0] / images[0].shape[1], 0.25, 2.0)
+    figure, panels = sheet(len(images), _BESIDE, max(5.0 / len(images), 2.5), aspect, 0.4)
+    for ax, image, pitch in zip(panels, eight_bit(np.stack(images)), cycle(pitches), strict=False):
+        show_image(ax, image, pitch, vmin=0, vmax=255)
+        ax.set_axis_on()
+    if len(every) > _MOST:
+        figure.suptitle(f"the first {_MOST} of {len(every)} images")
     return figure
 
 

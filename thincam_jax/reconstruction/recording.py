@@ -17,7 +17,6 @@ from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import unchecked
-from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -86,9 +85,11 @@ class Reconstruction(Module):
         return self.pitch is not None and self.pitch.ndim > 0
 
     def _repr_png_(self) -> bytes:
-        """Picture for notebooks: the image with gamma 2.2; planes and a batch side by side."""
-        images = pictures(self.image, planes=self.has_planes)
-        return png_bytes(eight_bit(np.concatenate(images, axis=1)))
+        """Figure for notebooks: axes in mm, gamma 2.2; planes and a batch side by side."""
+        from thincam_jax.plot.frame import as_png
+        from thincam_jax.plot.images import draw_result
+
+        return as_png(draw_result(self))
 
 
 class Recording(Module):
