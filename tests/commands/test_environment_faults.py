@@ -26,6 +26,9 @@ from thincam_jax.measured.read import read_image
 pytestmark = pytest.mark.thorough
 FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
 # Root may write no more than another user: prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE).
+NO_PRINT = "import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)"
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+NO_GPU = {"JAX_PLATFORMS": "cuda", "CUDA_VISIBLE_DEVICES": ""}
 NO_ROOT = "import ctypes, os; assert os.geteuid() or ctypes.CDLL(None).prctl(24, 1) == 0"
 
 
@@ -95,10 +98,14 @@ COMMANDS = [
 ]
 
 
-def start(command: Command, arguments: list[object], prepare: str = "", **settings: str) -> Popen:
+def start(command: Command, arguments: list[object], prepare: str = "") -> Popen:
+    return process([command.name, *arguments], prepare)
+
+
+def process(words: list[object], prepare: str = "", **settings: str) -> Popen:
     kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     path = os.pathsep.join(filter(None, [str(ROOT), kept.get("PYTHONPATH")]))
-    line = [sys.executable, "-m", "thincam_jax.commands.start", command.name, *map(str, arguments)]
+    line = [sys.executable, "-m", "thincam_jax.commands.start", *map(str, words)]
     if prepare:  # in the child: a fork of this process could hang in JAX's threads
         line = [sys.executable, "-c", f"{prepare}\nimport os; os.execv({line[0]!r}, {line})"]
     return Popen(
@@ -173,9 +180,29 @@ def test_two_at_once_on_one_cache(tmp_path):
     command = next(one for one in COMMANDS if one.name == "run")
     arguments, cache = command.arguments(tmp_path), {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     outs = [tmp_path / "first", tmp_path / "second", tmp_path / "third"]
-    children = [start(command, [*arguments, "--out", out], **cache) for out in outs[:2]]
+    children = [process(["run", *arguments, "--out", out], **cache) for out in outs[:2]]
     for child in children:
         ended(child)
-    ended(start(command, [*arguments, "--out", outs[2]], **cache))
+    ended(process(["run", *arguments, "--out", outs[2]], **cache))
     first, *others = (command.result(out) for out in outs)
     assert others == [first, first]
+
+
+@pytest.mark.parametrize(
+    ("words", "prepare", "settings", "code", "text"),
+    [
+        (["explain", ROOT / "configs/fza_superresolution.yaml"], "", ASCII, 0, "\\u03b2"),
+        (["schema", "study"], "", ASCII, 0, "fill_factor \\u2264 1"),
+        (["doctor"], "", {"MPLBACKEND": "banana"}, 0, "devices: cpu:0"),
+        (["doctor"], "", NO_GPU, 2, "JAX cannot start with JAX_PLATFORMS=cuda"),
+        (["doctor"], NO_PRINT, {}, 2, "No space left on device"),
+        (["--version"], NO_PRINT, {}, 2, "No space left on device"),
+        (["schema", "study"], NO_PRINT, {}, 2, "No space left on device"),
+    ],
+    ids=lambda one: " ".join(map(str, one)) if isinstance(one, list | dict) else "",
+)
+def test_a_faulty_environment_costs_a_line_or_nothing(words, prepare, settings, code, text):
+    child = process(words, prepare, PYTHONUNBUFFERED="", **settings)
+    printed, told = child.communicate(timeout=600)
+    assert child.returncode == code and "Traceback" not in told, told
+    assert told.count("\n") == (code > 0) and text in (told if code else printed)

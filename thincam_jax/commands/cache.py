@@ -72,10 +72,9 @@ def _drop_unfinished(folder: Path) -> None:
 
 def cache_state() -> str:
     """The folder and its size, or that it is not in use."""
-    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    folder = Path(chosen) if chosen else cache_folder()
-    if not chosen:
-        return f"{folder}, not in use"
+    if not (chosen := os.environ.get("JAX_COMPILATION_CACHE_DIR")):
+        return f"{cache_folder()}, not in use"
+    folder = Path(chosen)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     most = f" of at most {LARGEST / 2**20:.0f}" if folder == cache_folder() else ""
     return f"{folder}, {size / 2**20:.1f} MiB{most}"

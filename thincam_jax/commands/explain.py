@@ -27,7 +27,7 @@ def schema(
         if kind not in KINDS:
             raise ConfigError(f"kind: {kind!r} is unknown; choose one of {', '.join(KINDS)}")
         form = KINDS[kind].part(KINDS[kind].section).model_json_schema()
-    say(json.dumps(form, indent=2, ensure_ascii=False))
+    say(json.dumps(form, indent=2))
 
 
 def explain(config: ConfigFile, set_: Overrides = None) -> None:

@@ -3,26 +3,31 @@
 Imported before anything else, hence it imports next to nothing itself.
 """
 
+import io
 import os
 import sys
 
-from thincam_jax.commands.interrupt import INTERRUPTED, end_on_interrupt
+from thincam_jax.commands.interrupt import end_on_interrupt
 
 
 def main() -> None:
     """Run the command `thincam`."""
     end_on_interrupt()
     os.environ["MPLBACKEND"] = "agg"  # figures are files
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Each line at once, so that a full disk is told; escaped what the encoding lacks.
+        sys.stdout.reconfigure(errors="backslashreplace", line_buffering=True)
     from thincam_jax.commands.cli import app
 
     try:
         app(prog_name="thincam")
-    except SystemExit as end:
-        if end.code == INTERRUPTED:
-            # Not by way of the interpreter's end: threads that still compile may crash there.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
+    except (OSError, SystemExit) as end:
+        if isinstance(end, OSError):  # of standard output; commands tell all others
+            os.write(2, f"thincam: {end}\n".encode())
+        if code := getattr(end, "code", 2):
+            # Not by way of the interpreter's end: threads that still compile may crash there, and
+            # what could not be printed would be told again.
+            os._exit(code)
         raise
 
 

@@ -5,6 +5,7 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 
 import contextlib
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -104,14 +105,12 @@ def say_result(name: str, value: Any, text: str = "") -> None:
 
 def tell(text: str) -> None:
     """Lines on standard error, without markup: the first ones, each cut in its middle if long."""
-    from rich.console import Console
-
-    errors, lines = Console(stderr=True), escaped(text).split("\n")
+    lines = escaped(text).split("\n")
     if (more := len(lines) - _MOST_LINES) > 0:
         lines[_MOST_LINES:] = [f"and {more:,} more"]
     for line in lines:
         cut = line if len(line) <= 2 * _HALF else f"{line[:_HALF]} … {line[-_HALF:]}"
-        errors.print(f"thincam: {cut}", highlight=False, markup=False, soft_wrap=True)
+        print(f"thincam: {cut}", file=sys.stderr)
 
 
 def show(table: "Table") -> None:
