@@ -46,7 +46,7 @@ def draw_scenes(network: RefocusNetwork, batch: Batch, reading: Reading) -> Figu
         for ax in row:
             ax.set(xticks=[], yticks=[])
         for ax, (name, (image, like)) in zip(row, images.items(), strict=False):
-            ax.set_title(name.replace(", focused", ",\nfocused"), fontsize=9)
+            ax.set_title(name.replace(", focused ", ",\nfocused\n"), fontsize=9)
             levels = grey_levels(np.asarray(image[number]), white_level(np.asarray(like[number])))
             ax.imshow(levels[::-1, ::-1], cmap="gray", vmin=0, vmax=1)
         row[5].set_title("distance", fontsize=9)
