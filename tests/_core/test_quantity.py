@@ -41,7 +41,7 @@ def test_a_kind_is_read_in_the_unit_that_it_is_written_in(kind):
         (tc.Spectrum, "wavelengths", "mm", "wavelength"),
         (tc.PoissonGaussianNoise, "read_noise", "electrons", ""),
         (wg.SeeThroughCamera, "tilt", "rad", "angle"),
-        (Design, "wavelength", "mm", "length"),
+        (Design, "wavelength", "mm", "wavelength"),
     ],
 )
 def test_fields_tell_their_unit(owner, name, unit, kind):

@@ -91,7 +91,15 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     (tmp_path / place / "camera.yaml").write_text("", "utf-8")
     module = Path(kinds.__file__).relative_to(ROOT)
     monkeypatch.setattr(kinds, "__file__", str(tmp_path / module))
-    assert kinds.examples() == ["study", "refocus", "design", "capture", "learned", "camera"]
+    assert kinds.examples() == [
+        "study",
+        "refocus",
+        "screen",
+        "design",
+        "capture",
+        "learned",
+        "camera",
+    ]
 
 
 def test_a_list_tells_examples_from_kinds(tmp_path):

@@ -3,9 +3,6 @@
 import os
 from pathlib import Path
 
-# Not worth the time of asking what is free.
-_LITTLE = 2**25
-
 
 def available_bytes() -> int | None:
     """Free memory of the default device (of the machine, on a CPU); None where that is unknown."""
@@ -32,7 +29,7 @@ def available_bytes() -> int | None:
 
 def refuse_if_too_large(what: str, needed: int, advice: str) -> None:
     """MemoryError, one line with the estimate, where `needed` bytes cannot be had."""
-    available = None if needed < _LITTLE else available_bytes()
+    available = available_bytes()
     if available is not None and needed > available:
         raise MemoryError(
             f"{what} needs about {readable(needed)}, {readable(available)} are free; {advice}"

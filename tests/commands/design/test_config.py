@@ -380,5 +380,5 @@ def test_kinds_are_told_apart(tmp_path):
     with pytest.raises(ConfigError, match="give it to 'thincam design'"):
         load_experiment(path)
     for name, noun in (("quick", "a study"), ("fza_refocus", "a refocusing")):
-        with pytest.raises(ConfigError, match=f"kind: is {noun}; give it to 'thincam run'"):
+        with pytest.raises(ConfigError, match=f"{name}.yaml: is {noun}; give it to 'thincam run'"):
             tiny.load(ROOT / "configs" / f"{name}.yaml")
