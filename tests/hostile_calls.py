@@ -17,6 +17,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from hostile_images import IMAGES
 from hostile_rooms import ROOMS
 from hostile_table import OPTICS, Call
 from hypothesis import HealthCheck, given, seed, settings, strategies
@@ -48,7 +49,7 @@ VALUES = strategies.one_of(
 @strategies.composite
 def hostile(draw: strategies.DrawFn) -> Call:
     """One of the calls with one or two arguments replaced."""
-    made = draw(strategies.sampled_from((*OPTICS, *ROOMS)))
+    made = draw(strategies.sampled_from((*OPTICS, *ROOMS, *IMAGES)))
     for _ in range(draw(strategies.integers(1, 2))):
         made = made.replaced(draw(strategies.sampled_from(list(made.paths()))), draw(VALUES))
     return made

@@ -92,8 +92,8 @@ def camera(mask: Call = ZONES) -> Call:
 def seen(**arguments: Any) -> Call:
     return call(
         tc.Recording,
-        captures=IMAGE,
-        imaging_model=call(tc.Psfs, psfs=PSF, field_shape=(9, 12)),
+        captures=IMAGE[None],
+        imaging_model=call(tc.Psfs, psfs=PSF[None], field_shape=(9, 12)),
         **arguments,
     )
 

@@ -367,12 +367,23 @@ def test_masks_and_gains_of_operators_are_those_of_the_recording():
         assert float(total_objective(image, other)) == pytest.approx(float(first), rel=1e-12)
 
 
+def test_the_constructor_refuses_what_no_method_takes():
+    """Before a method is chosen: channels that differ, and a noise variance that is none."""
+    seen, psfs = np.ones((1, 3, 9, 12)), tc.Psfs(np.ones((1, 2, 7, 5)))
+    with pytest.raises(ValueError, match="3 channels and its PSF 2; give a PSF of 1 channel"):
+        tc.Recording(seen, psfs)
+    for variance, message in (("a", "give an array of real numbers"), (math.nan, "not finite")):
+        with pytest.raises((TypeError, ValueError), match=message):
+            tc.Recording(seen[:, :2], psfs, noise_variance=variance)
+
+
 def test_what_is_refused():
     seen = jnp.ones((2, *SENSOR.shape))
     for captures, psfs, settings, message in (
         (seen, jnp.ones((3, 4, 5)), {}, r"shape \(2, 52, 61\) for 3 cameras, PSFs or operators; g"),
         (seen, jnp.ones((4, 5)), {}, r"PSFs have shape \(4, 5\); give \(capture, k, l\), such as"),
         (seen, jnp.ones((2, 3, 4, 5)), {}, "1 channels and its PSF 3; give a PSF of 1 channel"),
+        (seen[:, :0], jnp.ones((2, 4, 5)), {}, r"captures have shape \(2, 0, 61\) for 2"),
         (seen[:, 0, 0], jnp.ones((2, 4, 5)), {}, r"captures have shape \(2,\) for 2 cameras"),
         (
             [seen[0], seen[1, 2:]],

@@ -203,8 +203,9 @@ def non_negative(name: str, value: Any, unit: str) -> Checked:
 def positive_all(name: str, value: Any, unit: str) -> Checked:
     """An array of any shape with finite positive entries."""
     array = finite(name, value, unit, shape=shape_of(value))
-    message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
-    return _require(array, lambda known: known > 0, message)
+    least = _LEAST if unit == "mm" else 0
+    message = f"{name} = {{}} {unit} must be positive; give {name} > {least:g} in {unit}"
+    return _require(array, lambda known: known > least, message)
 
 
 def _after(unit: str) -> str:
@@ -307,9 +308,10 @@ def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
         number = least - 1 if isinstance(value, bool) or np.ndim(value) else int(value)
     except (TypeError, ValueError, OverflowError):
         number = least - 1
-    if number < least or number != value or number > (_LARGEST_COUNT if most is None else most):
+    top = _LARGEST_COUNT if most is None else most
+    if number < least or number != value or number > top:
         small = most is None and number <= _LARGEST_COUNT
-        limits = f"of at least {least}" if small else f"from {least} to {most or _LARGEST_COUNT}"
+        limits = f"of at least {least}" if small else f"from {least} to {top}"
         raise ValueError(f"{name} = {shown(value)}: give a whole number {limits}")
     return number
 

@@ -42,7 +42,9 @@ def pictures(image: Any, *, planes: bool = False) -> list[np.ndarray]:
 
     With `planes` the last batch axis counts planes, and is not the colour channel.
     """
-    image = np.nan_to_num(np.asarray(image, dtype=float))
+    image = np.nan_to_num(checks.numbers("image", image).astype(float))
+    if image.ndim < 2 or image.size == 0:
+        raise ValueError(f"image has shape {image.shape}; give (y, x) or (3, y, x), not empty")
     if not planes and image.ndim == 3 and checks.colours_last(image.shape):
         return [image[..., :3]]
     if not planes and image.ndim > 2 and image.shape[-3] == 3:

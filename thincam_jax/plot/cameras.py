@@ -7,7 +7,8 @@ import matplotlib.figure
 import numpy as np
 import wadler_lindig as wl
 
-from thincam_jax._core.checks import Number
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.checks import Number, whole
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless import psf as psfs
 from thincam_jax.lensless.camera import LenslessCamera
@@ -97,6 +98,7 @@ def otf(
     return figure
 
 
+@checked
 def mask(mask: AbstractMask, *, wavelength: Number | None = None, samples: int = 512) -> Figure:
     """A mask's amplitude transmittance, and its phase where it delays the light.
 
@@ -104,7 +106,7 @@ def mask(mask: AbstractMask, *, wavelength: Number | None = None, samples: int =
     - `samples`: along the longer side of the mask.
     """
     height, width = (float(side) for side in mask.extent)
-    pitch = max(height, width) / samples
+    pitch = max(height, width) / whole("samples", samples, 1)
     grid = Grid((max(1, round(height / pitch)), max(1, round(width / pitch))), pitch)
     field = np.asarray(mask.sample(grid, wavelength))
     phase = np.angle(field) if np.iscomplexobj(field) else np.zeros(field.shape)

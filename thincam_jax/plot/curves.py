@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.checks import numbers
 from thincam_jax.plot.frame import Figure, new_figure
 from thincam_jax.reconstruction import Reconstruction
 
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from thincam_jax.design import FrontPoint, Sensitivity
 
 
+@checked
 def history(result: Reconstruction) -> Figure:
     """Objective and residuals of an iterative reconstruction over its iterations.
 
@@ -40,6 +43,7 @@ def history(result: Reconstruction) -> Figure:
     return figure
 
 
+@checked
 def landscape(
     values: Any, across: Any, down: Any, *, labels: tuple[str, str, str] = ("", "", "")
 ) -> Figure:
@@ -52,8 +56,8 @@ def landscape(
 
     **Errors**: ValueError where the shapes do not fit, or no value is finite.
     """
-    values, across, down = (np.asarray(v, dtype=float) for v in (values, across, down))
-    if values.shape != (down.size, across.size) or not np.isfinite(values).any():
+    values, across, down = (numbers("an argument", v).astype(float) for v in (values, across, down))
+    if values.shape != (*down.shape, *across.shape) or not np.isfinite(values).any():
         raise ValueError(
             f"values of shape {values.shape} over {across.size} values across and {down.size} "
             f"down; give finite values of shape ({down.size}, {across.size})"

@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib.figure
 import numpy as np
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, pixel_pitch
 from thincam_jax.imaging.display import eight_bit, pictures
 from thincam_jax.imaging.metrics import psnr
@@ -17,6 +18,7 @@ from thincam_jax.reconstruction import Reconstruction
 _BESIDE, _MOST = 4, 16  # images in a row, and in all, that a result shows of itself
 
 
+@checked
 def capture(image: Any, sensor: Sensor | Number) -> Figure:
     """A capture on its sensor, from zero to its own maximum.
 
@@ -35,6 +37,7 @@ def capture(image: Any, sensor: Sensor | Number) -> Figure:
     return figure
 
 
+@checked
 def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
     """Images beside each other, each from black to its own white, with gamma 2.2.
 
@@ -53,7 +56,7 @@ def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
             "of one of them"
         )
     arrays = {
-        name: pictures(getattr(one, "image", one), planes=_has_planes(one))[0]
+        name: pictures(getattr(one, "image", one), planes=getattr(one, "has_planes", False))[0]
         for name, one in images.items()
     }
     for name, image in arrays.items():
@@ -95,7 +98,3 @@ def draw_result(result: Reconstruction) -> matplotlib.figure.Figure:
     if len(every) > _MOST:
         figure.suptitle(f"the first {_MOST} of {len(every)} images")
     return figure
-
-
-def _has_planes(one: Any) -> bool:
-    return isinstance(one, Reconstruction) and one.has_planes

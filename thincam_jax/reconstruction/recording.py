@@ -128,20 +128,16 @@ class Recording(Module):
     def __init__(
         self, captures: Any, imaging_model: Any, *, noise_variance: Any = None, valid: Any = None
     ):
-        if (
-            isinstance(imaging_model, Sequence)
-            and imaging_model
-            and isinstance(imaging_model[0], LenslessCamera)
-        ):
-            raise TypeError(
-                "a list of cameras does not say in which light; give tc.Cameras(cameras, "
-                "wavelength=…, object_distance=…)"
-            )
         if isinstance(imaging_model, AbstractOperator):
             if is_shape(imaging_model.out_shape):
                 captures, valid = [captures], None if valid is None else [valid]
             imaging_model = [imaging_model]
         if isinstance(imaging_model, Sequence):
+            if any(isinstance(one, LenslessCamera) for one in imaging_model):
+                raise TypeError(
+                    "a list of cameras does not say in which light; give tc.Cameras(cameras, "
+                    "wavelength=…, object_distance=…)"
+                )
             if not all(isinstance(one, AbstractOperator) for one in imaging_model):
                 raise TypeError(
                     "imaging_model holds objects that are no operators; give operators only"
@@ -161,6 +157,8 @@ class Recording(Module):
         self.captures = tuple(as_real(c) for c in captures)
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
+        if noise_variance is not None:
+            given_variances(noise_variance, self.captures)  # refuses others
         self.valid = None if valid is None else self._masks(valid)
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
@@ -258,7 +256,7 @@ class Recording(Module):
         """Require one capture for each model; those of cameras and PSFs are images of one shape."""
         model, shapes = self.imaging_model, [c.shape for c in self.captures]
         count = len(model.operators) if isinstance(model, Stacked) else model.count
-        unlike = len(set(shapes)) > 1 or any(len(shape) < 2 for shape in shapes)
+        unlike = len(set(shapes)) > 1 or any(len(shape) < 2 or 0 in shape for shape in shapes)
         if len(shapes) != count or (unlike and not isinstance(model, Stacked)):
             raise ValueError(
                 f"captures have shape {given} for {count} cameras, PSFs or operators; give "
@@ -266,6 +264,13 @@ class Recording(Module):
             )
         if not isinstance(model, Stacked):
             checks.channels_first("a capture", shapes[0])
+        if isinstance(model, Psfs):
+            given, channels = (1, *shapes[0])[-3], model.psfs.shape[1]
+            if channels not in (1, given):
+                raise ValueError(
+                    f"a capture has {given} channels and its PSF {channels}; give a PSF of 1 "
+                    "channel or of as many"
+                )
         if isinstance(model, Cameras):
             sensor, pixels = model.cameras[0].sensor.shape, shapes[0][-2:]
             if pixels != sensor:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax.imaging.operators import Stacked
 from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod, State, admm_map
 from thincam_jax.reconstruction.iterate import CHUNK
@@ -18,6 +19,7 @@ from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.splittings import admm_method
 
 
+@checked
 class Stream(eqx.Module):
     r"""ADMM-TV of successive captures, a few iterations each, with image and duals kept.
 
@@ -85,11 +87,11 @@ class Stream(eqx.Module):
         """The stream after the next captures, and their image."""
         wanted = [c.shape for c in self.recording.captures]
         alone = len(wanted) == 1 and getattr(captures, "shape", None) == wanted[0]
-        given = [captures] if alone else captures
-        if [jnp.shape(c) for c in given] != wanted:
+        given = [captures] if alone or not checks.shape_of(captures) else captures
+        if (shapes := [checks.shape_of(c) for c in given]) != wanted:
             raise ValueError(
-                f"captures have shapes {[jnp.shape(c) for c in given]}, the first recording's "
-                f"{wanted}; give captures of the same camera, or start another stream"
+                f"captures have shapes {shapes}, the first recording's {wanted}; give captures of "
+                "the same camera, or start another stream"
             )
         state, image = _next(self, tuple(jnp.asarray(c) for c in given))
         return eqx.tree_at(lambda s: s.state, self, state), image

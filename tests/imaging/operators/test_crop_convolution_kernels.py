@@ -176,7 +176,7 @@ def test_planes_or_channels_that_are_missing():
 def test_bad_sizes():
     kernel = jnp.ones((3, 4, 6))
     for summed in (-1, 2):
-        with pytest.raises(ValueError, match=f"summed is {summed}, .* has 1 axes .* give 0 to 1"):
+        with pytest.raises(ValueError, match=f"summed = {summed}: .* from 0 to 1"):
             CropConvolution(kernel, PITCH, (5, 8), (6, 11), summed=summed)
     with pytest.raises(ValueError, match="sensor_shape = .* at least 1"):
         CropConvolution(kernel, PITCH, (0, 8), (6, 11))

@@ -41,7 +41,7 @@ def test_edge_across_the_rows_and_turned_round():
 
 
 def test_edge_errors():
-    with pytest.raises(ValueError, match="angle = nan"):
+    with pytest.raises(ValueError, match="angle is NaN"):
         slanted_edge((5, 6), math.nan)
 
 

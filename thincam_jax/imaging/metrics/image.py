@@ -8,7 +8,7 @@ import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Float64, Num
 
-from thincam_jax._core.checks import numbers
+from thincam_jax._core.checks import numbers, positive
 
 SSIM_WINDOW = 7  # pixels; scikit-image's uniform window
 _ROUNDING = 1e-14  # relative to the data range: an error this small is rounding
@@ -57,7 +57,7 @@ def psnr(
     Raises ValueError as `align` does, and for a data range that is not positive.
     """
     image, reference = _pair(image, reference)
-    _check_range(data_range)
+    positive("data_range", data_range, "")
     if aligned:
         image = align(image, reference)[0]
     if np.sqrt(np.mean((image - reference) ** 2)) <= _ROUNDING * data_range:
@@ -82,7 +82,7 @@ def ssim(
     than the window.
     """
     image, reference = _pair(image, reference)
-    _check_range(data_range)
+    positive("data_range", data_range, "")
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(
             f"images of shape {image.shape} are smaller than the SSIM window; give at least "
@@ -115,11 +115,3 @@ def _pair(image, reference) -> tuple[np.ndarray, np.ndarray]:
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds NaN or infinity; give finite numbers")
     return image.astype(np.float64), reference.astype(np.float64)
-
-
-def _check_range(data_range: float | int) -> None:
-    if not 0 < data_range < np.inf:
-        raise ValueError(
-            f"data_range = {data_range!r}: give the positive distance of the reference's largest "
-            "allowed value from its smallest"
-        )

@@ -6,6 +6,12 @@ Eager NumPy functions of a response sampled on ascending frequencies ≥ 0.
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Num
+
+from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
+
+Curve = Num[np.ndarray, "..."]
 
 # Frequencies, as a part of the highest, that count as low.
 _LOW = 0.05
@@ -14,7 +20,8 @@ _LOW = 0.05
 MINIMUM_COLUMNS = round(2 / _LOW) + 2
 
 
-def low_frequency_value(frequency: np.ndarray, response: np.ndarray) -> float:
+@checked
+def low_frequency_value(frequency: Curve, response: Curve) -> float:
     """Root mean square of the response over the lowest 5 % of the frequencies, without zero.
 
     The mean, because the response of a finite mask ripples, and that of a phase pair oscillates;
@@ -30,24 +37,23 @@ def low_frequency_value(frequency: np.ndarray, response: np.ndarray) -> float:
 
 
 def _check(frequency: np.ndarray, *responses: np.ndarray) -> None:
-    """Frequencies ascend from zero or above, and every response has a finite value at each."""
+    """Frequencies ascend from zero or above, and every response has a value at each."""
     shapes = {np.shape(array) for array in (frequency, *responses)}
     if len(shapes) > 1 or np.ndim(frequency) != 1 or not np.size(frequency):
         listed = ", ".join(str(np.shape(array)) for array in (frequency, *responses))
         raise ValueError(f"frequency and response have shapes {listed}; give equal lengths (n,)")
     if not (np.diff(frequency) > 0).all() or frequency[0] < 0:
         raise ValueError("frequency must ascend from zero or above; sort it and drop repeats")
-    if not all(np.isfinite(array).all() for array in (frequency, *responses)):
-        raise ValueError("frequency or response holds NaN or infinity; give finite numbers")
 
 
-def cut_off(frequency: np.ndarray, response: np.ndarray, part: float = 0.05) -> float:
+@checked
+def cut_off(frequency: Curve, response: Curve, part: float = 0.05) -> float:
     """Frequency above which the response stays under `part` of its low-frequency value.
 
     Linear interpolation between samples; the highest frequency if it never falls so low.
     """
     magnitude = np.abs(response)
-    level = part * low_frequency_value(frequency, response)
+    level = float(checks.fraction("part", part)) * low_frequency_value(frequency, response)
     if not level > 0:
         raise ValueError("the response is zero at low frequencies: it has no cut-off")
     above = np.flatnonzero(magnitude > level)
@@ -58,16 +64,19 @@ def cut_off(frequency: np.ndarray, response: np.ndarray, part: float = 0.05) -> 
     return float(frequency[last] + fall * (frequency[last + 1] - frequency[last]))
 
 
-def zero_crossings(frequency: np.ndarray, response: np.ndarray) -> np.ndarray:
+@checked
+def zero_crossings(frequency: Curve, response: Curve) -> np.ndarray:
     """All frequencies where a real response changes sign, by linear interpolation."""
+    _check(frequency, response)
     before, after = response[:-1], response[1:]
     change = np.flatnonzero((before != 0) & (np.sign(before) != np.sign(after)))
     step = np.diff(frequency)[change]
     return frequency[change] + step * before[change] / (before[change] - after[change])
 
 
+@checked
 def first_common_zero(
-    frequency: np.ndarray, responses: Sequence[np.ndarray], depth: float = 0.05
+    frequency: Curve, responses: Sequence[Curve], depth: float = 0.05
 ) -> float | None:
     """Lowest frequency that none of the real responses carries; None where there is none.
 
@@ -76,7 +85,7 @@ def first_common_zero(
     under `depth` of its low-frequency value. Either must be followed by a revival to twice that:
     the end of the band is the cut-off and no zero.
     """
-    if not responses:
+    if not len(responses):
         raise ValueError("responses is empty; give at least one")
     _check(frequency, *responses)
     total = np.sqrt(np.sum(np.square(responses), axis=0))

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Num
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax.imaging.metrics.image import align
 from thincam_jax.imaging.targets.usaf import POLARITIES, UsafElement, usaf1951, usaf1951_elements
 
@@ -35,6 +36,7 @@ class UsafContrast:
     modulation: float
 
 
+@checked
 def usaf_contrast(
     image: Num[ArrayLike, "..."],
     elements: Iterable[UsafElement],
@@ -60,7 +62,7 @@ def usaf_contrast(
 
     Raises ValueError for an image that is not (y, x) or not finite, or a set outside the image.
     """
-    pixels = np.asarray(image)
+    pixels = checks.numbers("image", image)
     elements = tuple(elements)
     checks.choice("polarity", polarity, POLARITIES)
     if pixels.ndim != 2:
@@ -72,6 +74,7 @@ def usaf_contrast(
     return [_measure(scaled, element, float(pixels_per_chart)) for element in elements]
 
 
+@checked
 def resolved_element(
     records: Sequence[UsafContrast], threshold: float | int = 0.1
 ) -> UsafElement | None:
@@ -84,8 +87,7 @@ def resolved_element(
     Raises ValueError for no records, an element without both of its sets, or a threshold that is
     not positive.
     """
-    if not threshold > 0:
-        raise ValueError(f"threshold = {threshold!r}: give a positive modulation, such as 0.1")
+    checks.positive("threshold", threshold, "")
     if not records:
         raise ValueError("records is empty; give those of usaf_contrast")
     sets: dict[tuple[int, int], dict[str, UsafContrast]] = defaultdict(dict)
@@ -154,10 +156,7 @@ def _layer_count(elements: tuple[UsafElement, ...]) -> int:
 def _check_inside(
     elements: tuple[UsafElement, ...], shape: tuple[int, ...], pixels_per_chart: float | int
 ) -> None:
-    if not 0 < pixels_per_chart < np.inf:
-        raise ValueError(
-            f"pixels_per_chart = {pixels_per_chart!r}: give a positive number of pixels"
-        )
+    checks.positive("pixels_per_chart", pixels_per_chart, "pixels")
     for element in elements:
         reach = np.abs(element.centre) + 2.5 * element.bar
         if np.any(reach * pixels_per_chart > np.asarray(shape) / 2 + 1e-6):

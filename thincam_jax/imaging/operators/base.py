@@ -175,8 +175,8 @@ def require_size(name: str, shape: Any, count: int, what: str) -> tuple[int, ...
         whole, sound = (), False
     if not sound or math.prod(whole) != count:
         raise ValueError(
-            f"{name} = {shape!r}, but the matrix has {count} {what}; give a tuple of whole numbers "
-            f"whose product is {count}"
+            f"{name} = {checks.shown(shape)}, but the matrix has {count} {what}; give a tuple of "
+            f"whole numbers whose product is {count}"
         )
     return whole
 

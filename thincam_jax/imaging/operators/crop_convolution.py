@@ -60,14 +60,11 @@ class CropConvolution(AbstractOperator):
     ):
         self.sensor_shape = checks.shape2d("sensor_shape", sensor_shape)
         self.field_shape = checks.shape2d("field_shape", field_shape)
-        self.summed = summed
+        kernel = checks.as_array(checks.array("kernel", kernel), floating=True)
+        pitch = checks.positive("pitch", pitch, "mm")
         if kernel.ndim < 2:
             raise ValueError(f"kernel has shape {kernel.shape}; give rows and columns of a PSF")
-        if not 0 <= summed <= kernel.ndim - 2:
-            raise ValueError(
-                f"summed is {summed}, but the kernel has {kernel.ndim - 2} axes before its rows; "
-                f"give 0 to {kernel.ndim - 2}"
-            )
+        self.summed = checks.whole("summed", summed, 0, kernel.ndim - 2)
         kernel = _fit(kernel, kernel_shape(self.sensor_shape, self.field_shape))
         smallest = window_shape(self.sensor_shape, self.field_shape, kernel.shape[-2:])
         self.window = smallest if window is None else checks.shape2d("window", window)

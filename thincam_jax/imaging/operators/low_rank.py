@@ -203,7 +203,8 @@ def _places(positions, points, field_shape) -> list[np.ndarray]:
     if positions is None:
         pairs = zip(field_shape, points, strict=True)
         return [np.linspace(0, n - 1, count) for n, count in pairs]
-    places = [np.asarray(real_numbers("positions", p), float) for p in positions]
+    both = positions if isinstance(positions, tuple | list) else [positions]
+    places = [np.asarray(real_numbers("positions", p), float) for p in both]
     if [p.shape for p in places] != [(n,) for n in points] or any(
         not (np.diff(p) > 0).all() for p in places
     ):

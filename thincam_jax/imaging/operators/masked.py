@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, DTypeLike, Float, PRNGKeyArray, PyTree
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
@@ -43,6 +44,7 @@ class AbstractAround(AbstractOperator):
         return self.operator.adjoint(self._weighted(capture))
 
 
+@checked
 class Masked(AbstractAround):
     r"""An operator whose dead or saturated pixels read zero.
 
@@ -67,6 +69,7 @@ class Masked(AbstractAround):
         return jax.tree.map(lambda part, valid: jnp.where(valid, part, 0), capture, self.valid)
 
 
+@checked
 class Scaled(AbstractAround):
     r"""An operator whose capture is multiplied by a gain.
 
@@ -111,7 +114,7 @@ def _times(capture, gain):
 
 
 def _boolean(name: str, value) -> Bool[Array, "..."]:
-    array = checks.as_array(value)
+    array = checks.array(name, value)
     if array.dtype != jnp.bool_:
         raise TypeError(
             f"{name} has dtype {array.dtype}; give booleans, True where a pixel counts (weights "

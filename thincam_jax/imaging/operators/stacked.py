@@ -4,9 +4,11 @@ from collections.abc import Sequence
 
 from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray, PyTree
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.imaging.operators.base import AbstractOperator, Shapes
 
 
+@checked
 class Stacked(AbstractOperator):
     r"""Operators of one image, one after the other.
 

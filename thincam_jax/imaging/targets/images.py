@@ -69,6 +69,7 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
     return _unit_range(_without_alpha(pixels, path), path)
 
 
+@checked
 def sample_image(name: str) -> Float64[np.ndarray, "y x *channel"]:
     """One of scikit-image's sample pictures as float64 in [0, 1], (y, x) or (y, x, 3).
 
@@ -102,14 +103,14 @@ def resize(
 
     Raises ValueError for a bad shape, or an image of other dimensions, empty or not finite.
     """
-    pixels = np.asarray(image)
+    pixels = checks.numbers("image", image)
     rows, columns = checks.shape2d("shape", shape)
     if pixels.ndim not in (2, 3) or pixels.size == 0:
         raise ValueError(
             f"image has shape {pixels.shape}; give (y, x) or (y, x, channel), not empty"
         )
-    if pixels.dtype.kind not in "fiub" or not np.isfinite(pixels).all():
-        raise ValueError(f"image of {pixels.dtype} is not all real and finite; give finite numbers")
+    if not np.isfinite(pixels).all():
+        raise ValueError("image holds NaN or infinity; give finite numbers")
     pixels = pixels.astype(np.float64)
     if pixels.shape[:2] == (rows, columns):
         return pixels

@@ -30,10 +30,8 @@ def slanted_edge(
     Raises ValueError for a bad shape, or for an angle or level that is not finite.
     """
     shape = checks.shape2d("shape", shape)
-    if not np.isfinite([angle, low, high]).all():
-        raise ValueError(
-            f"angle = {angle!r} rad, low = {low!r}, high = {high!r}: give finite numbers"
-        )
+    for name, value in {"angle": angle, "low": low, "high": high}.items():
+        checks.finite(name, value, "")
     y, x = _coordinates(shape)
     cosine, sine = math.cos(angle), math.sin(angle)
     a, b = max(abs(cosine), _THIN), max(abs(sine), _THIN)
@@ -58,8 +56,7 @@ def siemens_star(shape: tuple[int, int], spokes: int = 36) -> Float64[np.ndarray
     Raises ValueError for a bad shape or less than 2 spokes.
     """
     shape = checks.shape2d("shape", shape)
-    if isinstance(spokes, bool) or int(spokes) != spokes or spokes < 2:
-        raise ValueError(f"spokes = {spokes!r}: give a whole number of at least 2 bright sectors")
+    spokes = checks.whole("spokes", spokes, 2)
     y, x = _coordinates(shape)
     radius = np.hypot(y, x)
     safe = np.maximum(radius, 0.5)

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 
 Orientation = Literal["vertical", "horizontal"]
 POLARITIES = ("bright_on_dark", "dark_on_bright")
@@ -64,8 +65,8 @@ def usaf1951_elements(layers: int = 3, first_group: int = -2) -> tuple[UsafEleme
 
     Raises ValueError for less than one layer or an odd `first_group`.
     """
-    _check_layers(layers)
-    if int(first_group) != first_group or first_group % 2:
+    checks.whole("layers", layers, 1, 100)
+    if checks.whole("first_group", first_group, -100, 100) % 2:
         raise ValueError(
             f"first_group = {first_group!r} is not an even whole number; a layer begins with an "
             "even group, such as -2 or 0"
@@ -108,14 +109,10 @@ def usaf1951(
     Raises ValueError for a shape, layers, polarity or size that makes no chart.
     """
     rows, columns = checks.shape2d("shape", shape)
-    _check_layers(layers)
+    checks.whole("layers", layers, 1, 100)
     checks.choice("polarity", polarity, POLARITIES)
-    width = float(min(rows, columns) if pixels_per_chart is None else pixels_per_chart)
-    if not 0 < width < np.inf:
-        raise ValueError(
-            f"pixels_per_chart = {pixels_per_chart!r}: give a positive number of pixels, or None "
-            "for the smaller side of shape"
-        )
+    width = min(rows, columns) if pixels_per_chart is None else pixels_per_chart
+    checks.positive("pixels_per_chart", width, "pixels")
     image = np.zeros((rows, columns))
     for top, bottom, left, right in _rectangles(layers):
         _add_coverage(
@@ -127,15 +124,13 @@ def usaf1951(
     return image if polarity == "bright_on_dark" else 1.0 - image
 
 
+@checked
 def line_pair(element: UsafElement, width: float | int) -> float:
     """The period of an element, one bar and one gap, in mm, on a chart `width` mm wide.
 
     Its inverse is the spatial frequency in cycles/mm. Raises ValueError unless `width` > 0.
     """
-    if not 0 < width < np.inf:
-        raise ValueError(
-            f"width = {width!r} mm: give the width of the whole chart, positive, in mm"
-        )
+    checks.positive("width", width, "mm")
     return 2 * element.bar * float(width)
 
 
@@ -204,8 +199,3 @@ def _overlap(low: float, high: float, count: int) -> tuple[slice, np.ndarray]:
     stop = min(max(int(np.ceil(high)), start), count)
     edges = np.arange(start, stop)
     return slice(start, stop), np.minimum(edges + 1, high) - np.maximum(edges, low)
-
-
-def _check_layers(layers: int) -> None:
-    if isinstance(layers, bool) or int(layers) != layers or layers < 1:
-        raise ValueError(f"layers = {layers!r}: give a whole number of at least 1")

@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex
 from thincam_jax._core.quantity import choice, quantity
@@ -114,6 +115,7 @@ class SeparableMask(AbstractCellMask):
         return Patterns(np.ones(2), jnp.stack([a, 1 - a]), jnp.stack([1 - b, b]))
 
 
+@checked
 def maximum_length_sequence(length: int) -> Float[np.ndarray, " length"]:
     """A binary code of 0 and 1 and of length N = 2^m − 1, half of it open.
 

@@ -26,13 +26,9 @@ HIGHEST = 0.1
 
 def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Float[Array, "y x"]:
     """A real (y, x) map within its limits, or one line that says what is out of them."""
-    array = checks.as_array(values)
+    array = checks.as_array(checks.array(name, values), floating=True)
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(f"{name} has shape {array.shape}; give a non-empty array (y, x)")
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        if jnp.issubdtype(array.dtype, jnp.complexfloating):
-            raise TypeError(f"{name} is complex; give real numbers in {unit}")
-        array = checks.as_array(values, floating=True)
     if checks.is_traced(array):
         return array
     known = np.asarray(array)

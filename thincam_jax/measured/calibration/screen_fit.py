@@ -16,6 +16,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
@@ -236,6 +237,7 @@ class _Problem(eqx.Module):
         return self.start.moved(self.names, tuple(steps * self.unit))
 
 
+@checked
 def fit_screen(
     measured: Matrix | GhostPositions,
     camera: SeeThroughCamera,

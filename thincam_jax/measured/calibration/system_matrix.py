@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.capture_store import VERSION, opened, stored_array, zarr_library
 from thincam_jax._core.files import writing
 from thincam_jax._core.memory import refuse_if_too_large
@@ -43,6 +44,7 @@ def matrix_blocks(captures: HadamardCaptures) -> Iterator[Block]:
         yield pixels, block
 
 
+@checked
 def recover_matrix(captures: HadamardCaptures) -> Matrix:
     """H as an operator, in float32, for `Recording`: 3.2 GB for 64² cells and 440² pixels.
 

@@ -11,8 +11,9 @@ import scipy
 import skimage
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.reconstruction.depth.focus import Measure, focus_measure, gaussian_average
-from thincam_jax.reconstruction.depth.refocus import RefocusSweep
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep, increasing
 
 _FAINT = 0.02  # of the strongest focus: below, a pixel shows noise rather than a picture
 
@@ -52,6 +53,7 @@ class FocusCurves:
         return next(peak for peak in self.peaks if peak.region == region)
 
 
+@checked
 def find_distances(
     sweep: RefocusSweep,
     *,
@@ -126,6 +128,7 @@ def vertex(curve: np.ndarray, distances: np.ndarray, place: int) -> float:
     return float(1 / (u[1] + shift))
 
 
+@checked
 def object_regions(
     sweep: RefocusSweep,
     *,
@@ -144,11 +147,9 @@ def object_regions(
     images = sweep.images.reshape(-1, *sweep.images.shape[-2:])
     rows, columns = images.shape[-2:]
     width = 0.015 * float(np.hypot(rows, columns)) if smoothing is None else float(smoothing)
-    mean = jnp.mean(images, axis=0)
-    mean = np.asarray(gaussian_average(mean, width) if width > 0 else mean)
-    bright = scipy.ndimage.binary_dilation(
-        mean > threshold * mean.max(), iterations=max(1, round(width))
-    )
+    mean = np.asarray(gaussian_average(jnp.mean(images, axis=0), width))
+    widened = round(min(max(1, width), rows + columns))
+    bright = scipy.ndimage.binary_dilation(mean > threshold * mean.max(), iterations=widened)
     found = np.asarray(skimage.measure.label(bright))
     count = int(found.max())
     smallest = 0.005 * rows * columns if least is None else least
@@ -172,6 +173,7 @@ class DepthMap(eqx.Module):
     confidence: Float[Array, "*batch y x"]
 
 
+@checked
 def depth_map(
     sweep: RefocusSweep,
     *,
@@ -214,6 +216,7 @@ def _largest(focus, distances):
     return distance, jnp.where(peak > 0, contrast * strength, 0)
 
 
+@checked
 def all_in_focus(
     sweep: RefocusSweep, depth: DepthMap, *, smoothing: float | int = 8.0
 ) -> Float[Array, "*batch y x"]:
@@ -237,6 +240,7 @@ def _picked(images, distances, inverse):
     return (1 - share) * near + share * far
 
 
+@checked
 def depth_of_colours(
     images: Float[ArrayLike, "distance channel y x"], distances: Sequence[float | int]
 ) -> tuple[RefocusSweep, DepthMap, Float[Array, "channel y x"]]:
@@ -247,7 +251,7 @@ def depth_of_colours(
     - `distances`: mm, increasing.
     """
     images = jnp.asarray(images)
-    focus = jnp.asarray(distances, images.dtype)
+    focus = jnp.asarray(increasing(distances), images.dtype)
     sweep = RefocusSweep(jnp.mean(images, axis=1), focus, None)
     depth = depth_map(sweep)
     colours = [RefocusSweep(images[:, n], focus, None) for n in range(images.shape[1])]

@@ -14,12 +14,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import flat_root, product
 
 Measure = Literal["laplacian_variance", "gradient_energy", "gradient_sparsity"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 
 
+@checked
 def focus_measure(
     image: Float[Array, "*batch y x"] | Float[np.ndarray, "*batch y x"],
     measure: Measure = "laplacian_variance",
@@ -50,7 +52,7 @@ def focus_measure(
     window and a region.
     """
     checks.choice("measure", measure, MEASURES)
-    image = jnp.asarray(image)
+    image = checks.as_array(image, floating=True)
     average = _average(image.shape[-2:], image.dtype, window, region)
     smooth = gaussian_average(image, smoothing) if _width("smoothing", smoothing) else image
     if measure == "laplacian_variance":

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -46,6 +47,7 @@ class RefocusSweep(eqx.Module):
         return None if self.slope is None else self.slope * self.distances
 
 
+@checked
 def refocus_sweep(
     recording: Recording,
     distances: Numbers | Sequence[float | int],
@@ -118,7 +120,7 @@ def _focused(recording: Recording, distances: list[float]) -> list[Recording]:
 
 def increasing(distances: Numbers | Sequence[float | int]) -> list[float]:
     """The distances of a sweep, mm, checked: ValueError as of `refocus_sweep`."""
-    values = np.asarray(distances, dtype=float)
+    values = checks.numbers("distances", distances).astype(float)
     if values.ndim != 1 or values.size < _LEAST:
         raise ValueError(
             f"distances has shape {values.shape}; give a list of at least {_LEAST} distances in mm"
@@ -130,6 +132,7 @@ def increasing(distances: Numbers | Sequence[float | int]) -> list[float]:
     return values.tolist()
 
 
+@checked
 def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[Array, "*distance"]:
     r"""Change of object distance, mm, that takes an object out of focus.
 
@@ -157,7 +160,7 @@ def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[
             f"axial_resolution knows the curvature of a FresnelZoneAperture only; the camera has a "
             f"{type(mask).__name__}"
         )
-    t = checks.positive_all("object_distance", jnp.asarray(object_distance), "mm")
+    t = checks.positive_all("object_distance", object_distance, "mm")
     d = camera.distance
     t = t.astype(d.dtype)
     magnification = 1 + d / t
@@ -167,6 +170,7 @@ def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[
     return jnp.pi * t * (t + d) / (mask.beta * d * squared)
 
 
+@checked
 def refocus_distances(nearest: Number, farthest: Number, count: int) -> Float[Array, " count"]:
     """`count` distances from `nearest` to `farthest`, mm, evenly spaced in 1/t.
 
