@@ -32,6 +32,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome, Progress
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
+from thincam_jax.reconstruction.planes import warn_of_equal_planes
 from thincam_jax.reconstruction.problem import InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 from thincam_jax.reconstruction.synthesis import (
@@ -429,6 +430,7 @@ def _convolutions(channels, variances, pitch, field_shape, settings) -> InverseP
         (1.0 if c.valid is None else c.valid.astype(dtype)) / v
         for c, v in zip(channels, variances, strict=True)
     ]
+    warn_of_equal_planes(operators, weights)
     return InverseProblem(operators, [c.capture for c in channels], weights=weights, **settings)
 
 
