@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from commands.study import tiny
+from commands.sweep import mini
 from typer.testing import CliRunner
 
 from helpers import ROOT, full_disk
@@ -73,6 +74,21 @@ def test_run_prints_the_results_and_where_the_report_is(tmp_path):
     again = call(*command)
     assert again.exit_code == 0
     assert row in again.stdout
+
+
+@pytest.mark.thorough
+def test_the_same_file_with_another_value_gets_a_folder_of_its_own(tmp_path, monkeypatch):
+    """The two commands that the docs give, one after the other."""
+    monkeypatch.chdir(tmp_path)
+    file = mini.write(tmp_path)
+    first, second = call("run", file.name), call("run", file.name, "--set", "seed=4")
+    assert (first.exit_code, second.exit_code) == (0, 0), second.output
+    assert (
+        second.stderr == "thincam: runs/mini holds another configuration: writes to runs/mini-2\n"
+    )
+    for folder, seed in (("mini", 0), ("mini-2", 4)):
+        assert f"seed: {seed}\n" in (tmp_path / "runs" / folder / "config.yaml").read_text("utf-8")
+        assert (tmp_path / "runs" / folder / "report.html").exists()
 
 
 NOTHING = StudyScores("", 0, {}, [])

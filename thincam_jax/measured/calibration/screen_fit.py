@@ -481,10 +481,7 @@ def _report(problem: _Problem, samples: int | None, converged: bool) -> ScreenFi
     elif not of_matrix and mean > 1 + _UNEXPLAINED * (2 / freedom) ** 0.5:
         poor = f"the model does not explain the positions: χ² is {mean:.3g} per degree of freedom"
     if poor:
-        poor += (
-            "; it is another camera, further from the start than a few cells, or positions "
-            "are less accurate than their deviation says"
-        )
+        poor += "; the start is another camera or too far off, or the positions' deviation is wrong"
     stopped = "least squares did not converge; try fewer parameters, or a nearer start"
     alike = hardly_seen(names, curvature)
     values = {n: jnp.asarray(found.value(n)) for n in names} | ({"gain": gain} if of_matrix else {})
