@@ -26,7 +26,7 @@ from pydantic import (
 
 from thincam_jax._core import checks
 from thincam_jax._core.quantity import Quantity, quantities, quantity
-from thincam_jax.units import KINDS, parse_quantity
+from thincam_jax.units import KINDS, nm, parse_quantity
 
 _WITH_UNIT = r"^\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[^\d\s.eE].*$"
 _NEEDED = inspect.Parameter.empty
@@ -216,7 +216,7 @@ def descriptions(maker: Callable[..., Any]) -> dict[str, str]:
     return found
 
 
-LIGHT = (1e-5, checks.LONGEST_LIGHT)  # the wavelengths that are taken for light, mm
+LIGHT = (10 * nm, checks.LONGEST_LIGHT)  # the wavelengths that are taken for light, mm
 
 
 def _optical(value: float) -> float:

@@ -388,7 +388,7 @@ def choose_precision(
     if not isinstance(normal, SeparableNormal):
         raise ValueError(
             f"ridge = {rule!r} needs the modes of one separable term with one weight; give a "
-            "number, or a Separable of one term (truncated(terms=1)) and no dead pixels"
+            "number, or one term (truncated(terms=1).operator) and no dead pixels"
         )
     (difference,) = residuals(problem, mean)
     weighted = -jnp.sqrt(problem.weights[0]) * difference

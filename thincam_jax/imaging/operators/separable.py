@@ -34,7 +34,7 @@ class SeparableModes(eqx.Module):
         """Coefficient of each mode of one term in captures, ĝ."""
         if self.seen_rows is None or self.seen_columns is None:
             raise ValueError(
-                "these are modes of several terms; give those of one, truncated(terms=1)"
+                "these are modes of several terms; give those of one, truncated(terms=1).operator"
             )
         return product(product(self.seen_rows.T, captures), self.seen_columns)
 
