@@ -13,7 +13,7 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax import measured
-from thincam_jax.imaging.operators import CropConvolution, Separable
+from thincam_jax.imaging.operators import Separable
 from thincam_jax.units import mm, nm, um
 
 RANDOM = np.random.default_rng(0)
@@ -152,6 +152,7 @@ def prepared(**options: Any) -> Any:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_advice_can_be_followed(case):
     with pytest.raises(Exception, match=".") as caught, warnings.catch_warnings():

@@ -130,6 +130,7 @@ def test_a_near_miss_is_told_what_to_write(line, advice, tmp_path):
         assert followed.exit_code == 0 and "3 points" in followed.stdout, followed.output
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("line", "advice", "followed"),
     [
