@@ -22,7 +22,7 @@ test test-all test-lowest: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.installed-test ## Run the tests, e.g. make test ARGS="tests/test_units.py -k angle".
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
-test-all: .venv/.installed-test ## Run all tests, the thorough ones too (some 45 minutes).
+test-all: .venv/.installed-test ## Run all tests, the thorough ones too (75 minutes on two quiet cores).
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not full_size" $(ARGS)
 
 # The bounds of pyproject.toml as constraints; only other packages' deprecations are new then.
