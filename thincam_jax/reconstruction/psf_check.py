@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.grids import block_sum
+from thincam_jax._core.grids import block_mean, block_sum
 from thincam_jax.reconstruction.imaging_model import Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
@@ -46,6 +46,7 @@ _LEAST_ERROR = 0.007
 _SIGNIFICANCE = 3.0  # standard errors
 _TOLD = 0.01  # width of an interval of scales up to which a PSF is called the best
 _LEAST_GAIN = 0.02  # of the objective, for another orientation
+_KEPT = 0.8  # of a PSF's variance, by blocks that are fine enough
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,8 @@ def check_psf(
     **Arguments**
 
     - `recording`: captures of at least 32 pixels a side with `Psfs` of one plane. Some 20
-      reconstructions are made: average blocks of pixels until the longer side is 100 to 200.
+      reconstructions are made: average blocks of pixels until the longer side is 100 to 200, or 300
+      where these would blur the PSF.
     - `search`: range of the scale about 1, at most 0.5.
     - `tau`: as of `AdmmTV`.
     - `callback`: called with the number of PSFs tried and their total.
@@ -231,6 +233,16 @@ def check_psf(
         math.sqrt(2 * profile[lowest].misfits.sum() / try_psf.pixels),
         tuple(reasons),
     )
+
+
+def blocks_blur(psf: Float[np.ndarray, "*batch k l"], block: int) -> bool:
+    """Whether blocks of twice that side lose a fifth of the PSF's variance that these blocks keep.
+
+    Scales found with such blocks are up to four times less accurate than with all detail.
+    """
+    rows, columns = (n // (2 * block) * 2 * block for n in psf.shape[-2:])
+    kept = block_mean(psf[..., :rows, :columns], block)
+    return bool(np.var(block_mean(kept, 2)) < _KEPT * np.var(kept))
 
 
 class _Trial:

@@ -177,7 +177,7 @@ def check(
     psf_background: PsfBackground = None,
     downsample: Annotated[
         int | None,
-        Option(help="Side of the blocks that are averaged. Default: 160 pixels are left."),
+        Option(help="Side of the blocks that are averaged. Default: 160 pixels stay, or 320."),
     ] = None,
     bits: Bits = None,
     psf_bits: PsfBits = None,

@@ -22,6 +22,7 @@ from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, 
 from thincam_jax.measured.write import linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver
 from thincam_jax.reconstruction.depth import depth_of_colours
+from thincam_jax.reconstruction.psf_check import blocks_blur
 from thincam_jax.studies.prepared import (
     PixelNoise,
     PreparedResult,
@@ -335,12 +336,12 @@ def check_files(
 
 
 def enough_blocks(sources: Sources, capture: Path) -> Sources:
-    """The sources with a `downsample` that leaves about 160 pixels of the longer side."""
-    halved = sources.preparation.demosaicing == "superpixel" and sources.preparation.bayer
-    pixels = max(measured.read_image(capture, sources.bits).pixels.shape[:2])
-    pixels = pixels // (2 if halved else 1)
-    preparation = replace(sources.preparation, downsample=max(1, round(pixels / _SIDE)))
-    return replace(sources, preparation=preparation)
+    """Sources with blocks that leave some 160 pixels of a side, 320 where these blur the PSF."""
+    whole = Rig(sources).prepare(capture)
+    side = max(whole.capture.shape[-2:])
+    fine, coarse = (max(1, round(side / pixels)) for pixels in (2 * _SIDE, _SIDE))
+    block = fine if blocks_blur(whole.psf, fine) else coarse
+    return replace(sources, preparation=replace(sources.preparation, downsample=block))
 
 
 def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Output) -> int:
