@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design, Shot
 from thincam_jax.design.objectives import ObjectiveData, ResolutionLimit, bayes_error, limit
 from thincam_jax.design.problem import DesignProblem
@@ -53,7 +54,7 @@ def find_front(
     problems: Mapping[float, DesignProblem],
     settings: SearchSettings | None = None,
     *,
-    key: PRNGKeyArray,
+    key: Key,
     progress: Callable[[float], object] | None = None,
 ) -> tuple[FrontPoint, ...]:
     """The best design at each cost, in the order of the costs.
@@ -72,7 +73,7 @@ def find_front(
 
     `non_dominated` says which points no other one beats.
     """
-    search = FrontSearch(problems, settings or SearchSettings(), key)
+    search = FrontSearch(problems, settings or SearchSettings(), random_key(key))
     for place, beside in search.order:
         if progress is not None:
             progress(search.costs[place])

@@ -25,12 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import Channels, channels, ring_means
@@ -196,11 +197,7 @@ class Match(Module):
 
 @checked
 def match_response(
-    model: ResponseModel,
-    target: Numbers,
-    settings: MatchSettings = MatchSettings(),
-    *,
-    key: PRNGKeyArray,
+    model: ResponseModel, target: Numbers, settings: MatchSettings = MatchSettings(), *, key: Key
 ) -> Match:
     """The designs of a space whose levels are nearest to target ones.
 
@@ -214,6 +211,7 @@ def match_response(
 
     **Errors**: ValueError for target levels that are not finite or below 0.
     """
+    key = random_key(key)
     space = model.space
     levels = checked_levels(target, model.rings, space.lower.dtype)
     count = max(settings.samples, settings.starts)

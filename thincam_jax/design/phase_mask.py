@@ -352,7 +352,7 @@ def refine_mask(
     limits: HeightLimits,
     data: Any,
     *,
-    key: PRNGKeyArray,
+    key: Key,
     steps: int = 100,
 ) -> Refined:
     """A mask's heights, changed by Adam so that an objective falls; the limits are kept throughout.
@@ -365,6 +365,7 @@ def refine_mask(
 
     **Errors**: ValueError for limits and numbers of steps that are out of range.
     """
+    key = random_key(key)
     limits = limits.checked()
     stages = (1.0,) if limits.levels is None else _STAGES
     each = steps // len(stages)

@@ -15,6 +15,7 @@ from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner, place
 from thincam_jax.lensless.propagation.angular_spectrum import (
     padded_shape,
@@ -37,13 +38,7 @@ class Retrieval(Module):
 
 @checked
 def retrieve_phase(
-    target: Float[Array, "y x"],
-    grid: Grid,
-    path: Path,
-    *,
-    shape: Shape,
-    key: PRNGKeyArray,
-    steps: int = 100,
+    target: Float[Array, "y x"], grid: Grid, path: Path, *, shape: Shape, key: Key, steps: int = 100
 ) -> Retrieval:
     r"""The phase of a transparent mask whose PSF is near to a target (Gerchberg and Saxton 1972).
 
@@ -59,6 +54,7 @@ def retrieve_phase(
 
     **Errors**: ValueError for a target that is negative, not finite or without light.
     """
+    key = random_key(key)
     cells = checks.shape2d("shape", shape)
     if target.shape != grid.shape:
         raise ValueError(f"target has shape {target.shape} and its grid {grid.shape}")
@@ -118,7 +114,7 @@ _LEVELS = (-0.12, 0.12)
 
 @checked
 def contour_target(
-    key: PRNGKeyArray,
+    key: Key,
     grid: Grid,
     *,
     feature: Number,
@@ -136,6 +132,7 @@ def contour_target(
     - `line_width`: w, mm, from a sample to `feature`.
     - `levels`: the c; the noise has a standard deviation of about 0.25.
     """
+    key = random_key(key)
     feature = checks.positive("feature", feature, "mm")
     width = checks.positive("line_width", line_width, "mm")
     pitch = float(grid.pitch)

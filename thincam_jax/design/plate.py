@@ -22,13 +22,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.search import best_apart, even_samples, on_cube
 from thincam_jax.design.setup import PowerLaw
 from thincam_jax.design.stochastic import adam
@@ -216,7 +217,7 @@ def find_plate(
     viewing: Viewing,
     limits: PlateLimits,
     *,
-    key: PRNGKeyArray,
+    key: Key,
     starts: int = 4,
     samples: int = 32,
     steps: int = 60,
@@ -225,6 +226,7 @@ def find_plate(
 
     **Errors**: ValueError for limits that cross, and for counts below 1.
     """
+    key = random_key(key)
     checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
     for name in Plate.__dataclass_fields__:
         low, high = (float(getattr(end, name)) for end in (limits.lower, limits.upper))

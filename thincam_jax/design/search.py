@@ -23,6 +23,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import whole
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.space import DesignSpace, active_limits
@@ -107,13 +108,14 @@ class Search(Module):
 
 @checked
 def find_designs(
-    problem: DesignProblem, settings: SearchSettings | None = None, *, key: PRNGKeyArray
+    problem: DesignProblem, settings: SearchSettings | None = None, *, key: Key
 ) -> Search:
     """Designs of a space where an objective is smallest.
 
     Where the problem has `exact` data, the best few optima and the best sample are improved on
     them, and all designs found are ranked by them.
     """
+    key = random_key(key)
     settings = settings or SearchSettings()
     objective, space, data = problem.objective, problem.space, problem.data
     points, values = sampled(objective, space, data, max(settings.samples, settings.starts), key)
@@ -153,13 +155,14 @@ _GRADIENT = 3  # evaluations that one with its gradient counts as
 
 
 def random_search(
-    problem: DesignProblem, search: Search, settings: SearchSettings, *, key: PRNGKeyArray
+    problem: DesignProblem, search: Search, settings: SearchSettings, *, key: Key
 ) -> tuple[Design, int]:
     """The best of random designs at the cost of a search, and how many there were.
 
     An evaluation of a descent counts as three, for its gradient. The samples that are best by the
     problem's data are ranked by its exact ones, where it has them.
     """
+    key = random_key(key)
     space, batch = problem.space, max(settings.samples, settings.starts)
     count = batch + _GRADIENT * max(search.evaluations - batch, 0)
     every = jax.random.uniform(key, (count, space.size), space.lower.dtype)

@@ -10,6 +10,7 @@ import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from thincam_jax._core.module import Module
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.search import on_cube
@@ -34,7 +35,7 @@ def stochastic_descent(
     problem: DesignProblem,
     point: Float[Array, " variable"],
     *,
-    key: PRNGKeyArray,
+    key: Key,
     steps: int = 100,
     rate: float = 0.03,
 ) -> Descent:
@@ -43,6 +44,7 @@ def stochastic_descent(
     - `problem`: its objective is (design, data, key) → a number, at module level.
     - `rate`: of the angle that sin² maps onto the cube; the cube's side is π/2 of it.
     """
+    key = random_key(key)
     if steps < 2 or not rate > 0:
         raise ValueError(
             f"steps = {steps}, rate = {rate}: give at least 2 steps and a rate above 0"

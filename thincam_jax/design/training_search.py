@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.quantity import whole
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.end_to_end import end_to_end_error
 from thincam_jax.design.landscape import Landscape, drawn_variables, landscape_if_any
@@ -105,7 +106,7 @@ def train_designs(
     points: Sequence[np.ndarray],
     settings: TrainingSettings | None = None,
     *,
-    key: PRNGKeyArray,
+    key: Key,
 ) -> TrainedDesigns:
     """Designs of least training error, by descents from the best of points and even samples.
 
@@ -115,6 +116,7 @@ def train_designs(
 
     **Errors**: NonFiniteObjectiveError where the error is NaN at every start.
     """
+    key = random_key(key)
     descents = TrainingDescents(problem, points, settings or TrainingSettings(), key)
     for number in range(descents.settings.starts):
         descents.descend(number)
@@ -232,7 +234,7 @@ def build_training(
     synthesis: Float[np.ndarray, "channel capture"],
     *,
     pixels: int,
-    key: PRNGKeyArray,
+    key: Key,
 ) -> Training:
     """Training on the grey middle squares of photographs, for all distances of a space.
 
@@ -241,6 +243,7 @@ def build_training(
 
     - `photographs`: (y, x) or (y, x, channel). `pixels`: along the sensor's side.
     """
+    key = random_key(key)
     setup = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), setup)
     # Pixels of the object about as large as those of the sensor at the longest distance.
     distances = space.reach("distance")

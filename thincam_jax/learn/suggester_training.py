@@ -19,11 +19,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.match import ResponseModel
 from thincam_jax.design.search import even_samples
 from thincam_jax.design.stochastic import adam
@@ -88,12 +89,13 @@ class SuggesterTraining:
 
 @checked
 def train_suggester(
-    model: ResponseModel, settings: SuggesterTraining = SuggesterTraining(), *, key: PRNGKeyArray
+    model: ResponseModel, settings: SuggesterTraining = SuggesterTraining(), *, key: Key
 ) -> TrainedSuggester:
     """A network that answers `suggest` for one camera and the space of a `ResponseModel`.
 
     **Errors**: ValueError where no sampled design has a finite response.
     """
+    key = random_key(key)
     dtype = model.space.lower.dtype
     of_samples, of_network, of_steps = jax.random.split(key, 3)
     points, levels = _examples(model, settings.samples, of_samples)

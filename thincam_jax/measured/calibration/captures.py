@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray, Real
+from jaxtyping import Array, Real
 
 from thincam_jax._core import checks
 from thincam_jax._core.capture_store import (
@@ -25,6 +25,7 @@ from thincam_jax._core.capture_store import (
     listed,
 )
 from thincam_jax._core.checks import Shape
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.imaging.operators import AbstractOperator
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
@@ -219,7 +220,7 @@ def open_captures(path: str | Path) -> HadamardCaptures:
 def simulate_captures(
     writer: CaptureWriter,
     operator: AbstractOperator,
-    key: PRNGKeyArray,
+    key: Key,
     *,
     deviation: float = 0.0,
     offset: float = 0.0,
@@ -232,6 +233,7 @@ def simulate_captures(
 
     **Errors**: ValueError where the operator's shapes are not those of the cells and the sensor.
     """
+    key = random_key(key)
     captures = writer.captures
     series, shape = captures.series, captures.sensor_shape
     given, wanted = (operator.in_shape, operator.out_shape), (series.object_shape, shape)
