@@ -1,8 +1,9 @@
 """Frames of a camera on disk, written frame by frame and read by sensor rows.
 
 A Zarr store (version 3) with the array `frames` (frame, y, x) and, for each frame, a 64 bit digest
-of its pixels, 0 where it has not been captured. A chunk holds some frames of some rows, with a
-checksum of its own. No compression: the last bits of a camera are noise.
+of its pixels, 0 where it has not been captured. Its metadata are OME-Zarr's too, version 0.5, by
+which viewers such as napari open the frames as a series. A chunk holds some frames of some rows,
+with a checksum of its own. No compression: the last bits of a camera are noise.
 """
 
 import contextlib
@@ -27,6 +28,26 @@ _NAMED = 8  # frames that a message lists
 _LARGEST = 2**30  # bytes of a frame, and of a chunk
 _MOST = 2**20  # frames
 _DESCRIBED = 2**24  # bytes of a file of metadata, of digests, and of a chunk of a matrix
+# OME-Zarr's description of the frames: one after the other, in pixels.
+_SERIES = {
+    "version": "0.5",
+    "multiscales": [
+        {
+            "name": "frames",
+            "axes": [
+                {"name": "frame", "type": "time"},
+                {"name": "y", "type": "space"},
+                {"name": "x", "type": "space"},
+            ],
+            "datasets": [
+                {
+                    "path": "frames",
+                    "coordinateTransformations": [{"type": "scale", "scale": [1.0, 1.0, 1.0]}],
+                }
+            ],
+        }
+    ],
+}
 
 
 class CaptureStoreError(MeasurementError):
@@ -122,7 +143,8 @@ class CaptureStore:
         row = together * shape[2] * np.dtype(dtype).itemsize
         rows = shape[1] if together == 1 else min(shape[1], max(1, _CHUNK // row))
         with writing(path):
-            group = zarr.create_group(path, attributes={"version": VERSION, **attributes})
+            known = {"version": VERSION, "ome": _SERIES, **attributes}
+            group = zarr.create_group(path, attributes=known)
             group.create_array(
                 "frames",
                 shape=shape,
