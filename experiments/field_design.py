@@ -32,7 +32,7 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 # reaches 90 mm from the axis, 19.8°. The pixels are enlarged with d, so that those of all distances
 # are the same on the object; the mask is moved so that the point's shadow stays in the middle.
 
-count, part = {"full": (768, 1), "small": (128, 2)}[SIZE]
+count, part = {"full": (768, 1), "small": (192, 2)}[SIZE]
 object_distance, edge, reference = 250.0, 90.0, 6.5
 width, beta_1, beta_2 = 5.632 / part, 25.0 * part, 21.0 * part
 pitch = 8.45 / part / count  # at d = 6.5 mm

@@ -57,6 +57,7 @@ def test_table_has_a_row_for_each_method(result):
 
 
 def test_figures_are_those_of_pyplot(result):
+    pyplot.close("all")
     try:
         figures = result.plot(), result.plot("picture"), result.plot_responses()
         assert len(pyplot.get_fignums()) == 3
