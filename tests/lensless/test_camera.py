@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from thincam_jax._core.precision import cast
 from thincam_jax.units import nm, um
 
 MASK = tc.FresnelZoneAperture(25.0, width=5.632)
@@ -77,6 +78,15 @@ def test_a_point_known_to_lie_on_an_axis_of_the_mask_is_not_skew_inside_jit():
 
     trace(3.0, jnp.zeros(2))
     assert skew == [False, False, True, True, True]
+
+
+def test_a_point_takes_the_precision_of_its_camera():
+    """Along an axis, too; so does one that is traced."""
+    single, at = cast(CAMERA, "float32"), np.array([0.0, 7.0])
+    path = single.path(500 * nm, 250.0, at)
+    assert path.at.dtype == jnp.float32 and not path.skew
+    traced = jax.eval_shape(lambda at: single.path(500 * nm, 250.0, at).at, jnp.asarray(at))
+    assert traced.dtype == jnp.float32
 
 
 def test_swapped_arguments_are_refused():

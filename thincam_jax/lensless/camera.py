@@ -72,6 +72,8 @@ class LenslessCamera(Module):
             elif any(map(checks.is_traced, at)):
                 at = jnp.stack([jnp.asarray(n, self.distance.dtype) for n in at])
         path = Path(wavelength, self.distance, object_distance, at)
+        convert = jnp.asarray if checks.is_traced(path.at) else np.asarray
+        path = replace(path, at=convert(path.at, dtype=self.distance.dtype))
         return replace(path, skew=not on_an_axis and path.is_skew(self.mask.centre))
 
     def _knows_axis(self, at: Position) -> bool:

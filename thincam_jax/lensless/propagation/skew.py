@@ -75,7 +75,7 @@ def skew_image(
         def added(field, order):
             g, weight = order
             wave = weight * _order(g, matrix, mask.extent, down, across)
-            return field + wave.astype(field.dtype), None  # the point's own may be a wider one
+            return field + wave.astype(field.dtype), None  # the light's own may be wider
 
         none = jnp.zeros(grid.shape, zones.coefficients.dtype)
         field, _ = jax.lax.scan(added, none, (curvatures, zones.coefficients))
