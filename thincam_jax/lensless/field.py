@@ -59,13 +59,13 @@ def field_operator(
     - `tolerance`: relative L2 error of the PSFs over the field, at most half of it by the
       polynomials and the rest by the sum of convolutions. With 1 the PSF is that of the axis, and
       the light that of every point: that serves most captures, see `plan`.
-    - `model`: of the PSFs, averaged over the pixels, see `psf`. Cells off both axes need
-      `PsfMethod("angular_spectrum", oversampling=...)`.
+    - `model`: of the PSFs, averaged over the pixels, see `psf`. Cells off both axes are sampled,
+      with more samples by `PsfMethod("angular_spectrum", oversampling=...)`.
 
     **Returns** the operator and its two errors. Numbers must be known: call it outside of jit.
 
     **Errors**: ValueError for what is out of range, and where 21 points an axis are too few;
-    TypeError for a mask that the model does not have off both axes.
+    TypeError for lenses, which "separable" does not have off both axes.
 
     ```python
     import jax.numpy as jnp

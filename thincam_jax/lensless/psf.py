@@ -32,7 +32,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
-from thincam_jax.lensless.propagation.obliquity import require_off_axis
+from thincam_jax.lensless.propagation.obliquity import require_off_axis, sampled_off_axis
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.radial import profile_samples, radial
@@ -62,7 +62,10 @@ def psf(
     - `object_distance`: t, mm; infinity is a plane wave.
     - `at`: (y, x) of the point, mm, by default on the axis; of a plane wave the tangents of its
       angles. The shadow then moves by −d/t of it, and the waves are those about the ray through the
-      mask's middle (`thincam_jax.lensless.propagation.Path`).
+      mask's middle (`thincam_jax.lensless.propagation.Path`). Of cells off both axes, and of rings,
+      "separable" then samples: for a MURA of 23 × 23 cells of 62 µm (d = 6.5 mm, averages over
+      pixels of 22 µm) 0.8 % off at 20° and 30°, at azimuths of 30° and 45°; 6 % at the centres of
+      pixels. A traced point counts as off both axes, unless one coordinate is a plain 0.
     - `model`: "geometric", "paraxial", "closed_form", "separable" (of rings "radial"),
       "angular_spectrum" or "rayleigh_sommerfeld"; each is documented in
       `thincam_jax.lensless.propagation`. A `PsfMethod` sets the precision and the samples of a
@@ -90,8 +93,10 @@ def psf(
     **See also**: `otf`, `select_model`, `capture`.
     """
     grid = camera.sensor.grid
+    path = camera.path(wavelength, object_distance, at)
+    model = sampled_off_axis(camera.mask, grid, path, model)
     method = psf_method(camera.mask, grid, model, pixel_integration)
-    return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance, at), method)
+    return _evaluate(_psf, camera.mask, grid, path, method)
 
 
 def psf_about_ray(
@@ -103,8 +108,8 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     grid = camera.sensor.grid
-    method = psf_method(camera.mask, grid, method, method.pixel_integration)
     path = replace(camera.path(wavelength, object_distance, at), follows=True)
+    method = psf_method(camera.mask, grid, sampled_off_axis(camera.mask, grid, path, method))
     return _evaluate(_psf, camera.mask, grid, path, method)
 
 
@@ -157,8 +162,10 @@ def otf(
     **See also**: `psf`, `fringe_scanned_otf`.
     """
     grid = camera.sensor.grid
+    path = camera.path(wavelength, object_distance, at)
+    model = sampled_off_axis(camera.mask, grid, path, model)
     method = psf_method(camera.mask, grid, model, pixel_integration)
-    return _evaluate(_otf, camera.mask, grid, camera.path(wavelength, object_distance, at), method)
+    return _evaluate(_otf, camera.mask, grid, path, method)
 
 
 def _irradiance(
@@ -242,8 +249,8 @@ def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfM
             f"a PSF of {rows}×{columns} pixels by model {method.model!r}",
             psf_cost(mask, grid, method).bytes,
             "use a smaller grid"
-            if method.model == "separable"
-            else "use a smaller grid, less oversampling or the model 'separable'",
+            if method.model not in SAMPLED
+            else "use a smaller grid or less oversampling",
         )
         result = function(mask, grid, path, method)
     return result if method.precision == own else cast(result, own)

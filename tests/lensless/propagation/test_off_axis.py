@@ -14,6 +14,7 @@ from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
+from thincam_jax.lensless.psf import psf_about_ray
 from thincam_jax.units import deg, nm, um
 
 SENSOR = tc.Sensor((9, 12), 150 * um)
@@ -138,6 +139,42 @@ def test_cells_are_within_a_percent_along_an_axis(angle, most, axis):
     with jax.numpy_dtype_promotion("standard"):
         single = tc.psf(camera("float32"), pixel_integration=True, **light)
     assert single.dtype == jnp.float32 and relative(np.asarray(single, float), found) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("mask", "most"),
+    [
+        (tc.ModifiedUniformlyRedundantArray(11, cell=62 * um), 17),
+        pytest.param(tc.RadialMask([1, 0, 1], 0.11), 17, marks=pytest.mark.thorough),
+        # Of more terms than are squared one by one; no warning of the closed form's average.
+        pytest.param(tc.random_cells(0, 0.65, 5 * um), 35, marks=pytest.mark.thorough),
+    ],
+)
+def test_edges_without_a_closed_form_are_sampled(mask, most):
+    """Within about a percent of more samples; the axis' PSF is over 10 % off."""
+    camera = tc.LenslessCamera(mask, tc.Sensor((12, 16), 22 * um), 6.5)
+
+    def about_ray(at, model="separable", samples=None):
+        method = tc.PsfMethod(model, pixel_integration=True, oversampling=samples)
+        return psf_about_ray(camera, 500 * nm, INF, at, method)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = about_ray(tangents(20, 30))
+    exact = about_ray(tangents(20, 30), "angular_spectrum", most)
+    assert relative(found, exact) < 0.012
+    on_axis = tc.PsfMethod("angular_spectrum", pixel_integration=True, oversampling=7)
+    assert relative(psf_about_ray(camera, 500 * nm, INF, None, on_axis), exact) > 0.1
+
+
+@pytest.mark.thorough
+def test_under_jit_known_cells_are_sampled_as_outside():
+    camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
+    light = {"wavelength": 500 * nm, "object_distance": 30.0, "at": (0.4, 0.3)}
+    scaled = jax.jit(lambda scale: scale * tc.psf(camera, **light))(2.0)
+    np.testing.assert_allclose(scaled, 2 * tc.psf(camera, **light), rtol=1e-9, atol=1e-12)
+    steep = jax.jit(lambda scale: scale * tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1)))
+    assert np.all(np.isfinite(steep(2.0)))
 
 
 def test_the_detour_turns_waves_as_the_distance_does():
@@ -289,8 +326,9 @@ def test_single_precision(at):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("averaged", [False, True])
-def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged):
-    camera, at = camera_of(), np.array([5.0, 7.0])
+@pytest.mark.parametrize("at", [(5.0, 7.0), (0.0, 7.0)])
+def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged, at):
+    camera, at = camera_of(), np.array(at)
     light = {"wavelength": np.float64(500 * nm), "object_distance": 100.0}
     light |= {"pixel_integration": averaged}
     exact = tc.psf(camera, at=at, **light)
@@ -320,8 +358,8 @@ def test_models_of_the_axis_say_so(model):
         tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1), model=model)
 
 
-def test_cells_off_both_axes_name_the_sampled_model():
-    camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
+def test_lenses_off_both_axes_name_the_sampled_model():
+    camera = tc.LenslessCamera(tc.LensletArray(5.0, 0.4, (2, 3)), SENSOR, DISTANCE)
     with pytest.raises(TypeError, match=r"on one of its axes only; give at = \(y, 0\) or \(0, x\)"):
         tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1))
     h = tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1), model="angular_spectrum")
