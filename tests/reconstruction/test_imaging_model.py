@@ -7,6 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
+from thincam_jax.imaging.operators import Stacked, adjoint_error
 from thincam_jax.reconstruction.imaging_model import register, registered_shape
 from thincam_jax.units import nm, um
 
@@ -116,12 +117,31 @@ def test_filters_over_the_field_divide_by_the_light(solver):
     assert abs(slope) < 0.4 < before
 
 
+@pytest.mark.parametrize("tolerance", [1.0, pytest.param(0.02, marks=pytest.mark.thorough)])
+def test_over_the_field_at_several_distances(tolerance):
+    """Each camera as alone, of a smooth scene on its own samples; the adjoint is the transpose."""
+    mask, shape = tc.FresnelZoneAperture(25.0, width=1.0), (40, 48)
+    cameras = [tc.LenslessCamera(mask, tc.Sensor(shape, 30 * um), d) for d in (6.5, 5.2)]
+    model = tc.PsfMethod("separable", field_tolerance=tolerance)
+    light = {"wavelength": 500 * nm, "object_distance": 250.0, "model": model}
+    far, near = tc.Cameras(cameras, **light).field_operators(shape)
+    own = tuple(near.operator.in_shape)
+    assert own == (32, 40)
+    (alone,) = tc.Cameras(cameras[1:], **light).field_operators(own)
+    (farther,) = tc.Cameras(cameras[:1], **light).field_operators(shape)
+    (y, x), (v, u) = pixels(shape), pixels(own)
+    scene, expected = jnp.asarray(blob(y, x)), alone(jnp.asarray(blob(1.25 * v, 1.25 * u)))
+    np.testing.assert_allclose(far(scene), farther(scene), rtol=1e-12)
+    assert relative_l2(np.asarray(near(scene)), np.asarray(expected)) < 0.01
+    assert adjoint_error(Stacked([far, near]), jax.random.key(0)) < 1e-12
+
+
 @pytest.mark.thorough
 def test_over_the_field_refuses():
     model = tc.PsfMethod("separable", field_tolerance=1.0)
     recording, _ = wide_recording(model)
     planes, _ = wide_recording(model, object_distance=[200.0, 250.0])
-    with pytest.raises(ValueError, match="are for one object_distance and for cameras at one"):
+    with pytest.raises(ValueError, match="are for one object_distance; give one, or no"):
         planes.problem()
     with pytest.raises(ValueError, match="model"):
         wide_recording("separabel")

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid
@@ -19,20 +20,27 @@ from thincam_jax._core.precision import allow, as_complex, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.digits import require_digits
-from thincam_jax.lensless.masks.base import AbstractMask, require_factored
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AbstractMask,
+    require_factored,
+    term_count,
+)
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     SAMPLED,
     Model,
     PsfMethod,
+    as_method,
     has_few_terms,
+    odd_from,
     psf_method,
 )
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
-from thincam_jax.lensless.propagation.obliquity import require_off_axis, sampled_off_axis
+from thincam_jax.lensless.propagation.obliquity import require_off_axis
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.radial import profile_samples, radial
@@ -42,6 +50,9 @@ from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
 from thincam_jax.lensless.propagation.skew import PIXEL_POINTS, skew_image
 from thincam_jax.lensless.sampling import require_phase_sampling
+
+# Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
+_IN_CELL, _UNKNOWN_CELL = 16, 7
 
 
 @checked
@@ -92,11 +103,8 @@ def psf(
 
     **See also**: `otf`, `select_model`, `capture`.
     """
-    grid = camera.sensor.grid
     path = camera.path(wavelength, object_distance, at)
-    model = sampled_off_axis(camera.mask, grid, path, model)
-    method = psf_method(camera.mask, grid, model, pixel_integration)
-    return _evaluate(_psf, camera.mask, grid, path, method)
+    return _evaluate(_psf, camera, path, as_method(model, pixel_integration))
 
 
 def psf_about_ray(
@@ -107,10 +115,8 @@ def psf_about_ray(
     method: PsfMethod,
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
-    grid = camera.sensor.grid
     path = replace(camera.path(wavelength, object_distance, at), follows=True)
-    method = psf_method(camera.mask, grid, sampled_off_axis(camera.mask, grid, path, method))
-    return _evaluate(_psf, camera.mask, grid, path, method)
+    return _evaluate(_psf, camera, path, method)
 
 
 def spectral_psf(
@@ -161,11 +167,8 @@ def otf(
 
     **See also**: `psf`, `fringe_scanned_otf`.
     """
-    grid = camera.sensor.grid
     path = camera.path(wavelength, object_distance, at)
-    model = sampled_off_axis(camera.mask, grid, path, model)
-    method = psf_method(camera.mask, grid, model, pixel_integration)
-    return _evaluate(_otf, camera.mask, grid, path, method)
+    return _evaluate(_otf, camera, path, as_method(model, pixel_integration))
 
 
 def _irradiance(
@@ -229,9 +232,31 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> PsfMethod:
+    """The method; in place of "separable" samples where a mask of edges has no closed form.
+
+    That is of rings off the axis, and of cells off both axes, whose integrals have no product.
+    Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an edge's wave, leave about 1 %.
+    """
+    cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
+    beyond = path.skew and cells or path.at is not None and mask.exact_model == "radial"
+    if method.model != "separable" or not beyond:
+        return method
+    samples, light = _UNKNOWN_CELL, (path.wavelength, path.distance, path.object_distance)
+    if not any(map(checks.is_traced, jax.tree.leaves((mask, grid, light)))):
+        with jax.ensure_compile_time_eval():  # they are known under jit, too
+            zone = math.sqrt(path.wavelength * path.distance / path.magnification)
+            finest = mask.finest_frequency
+            cell = zone if finest is None else 0.5 / float(finest)
+            samples = odd_from(_IN_CELL * float(grid.pitch) / math.sqrt(cell * zone))
+    return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
+
+
+def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
     """In the method's precision; the result comes back in the camera's."""
-    own = precision_of(grid.pitch)
+    mask, grid = camera.mask, camera.sensor.grid
+    method, own = _sampled_off_axis(mask, grid, path, method), precision_of(grid.pitch)
+    method = psf_method(mask, grid, method)
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
     averaged = method.pixel_integration and method.nodes is None

@@ -15,7 +15,7 @@ from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import unchecked
-from thincam_jax.imaging.operators import LowRank, kernel_grid
+from thincam_jax.imaging.operators import LowRank, Resampled, kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import field_fit, tangents_of
 from thincam_jax.lensless.light import light_over_field
@@ -60,8 +60,8 @@ class Cameras(Module):
       outside. Its pixels are p·t/d apart on the object, d the largest distance.
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`. With
       `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
-      (`field_operator`), for solvers by iteration of cameras at one distance. Filters take the
-      PSF of the axis, and divide the image by the light.
+      (`field_operator`), for solvers by iteration. Filters take the PSF of the axis, and divide the
+      image by the light.
 
     ```python
     import thincam_jax as tc
@@ -132,20 +132,25 @@ class Cameras(Module):
         sensor, tangents = self._furthest.sensor, tangents_of(self._furthest, field)
         return jnp.asarray(light_over_field(sensor, *tangents))
 
-    def field_operators(self, field: tuple[int, int]) -> tuple[LowRank, ...]:
-        """The operator of each camera over its field, from the object as it lies on the sensor."""
+    def field_operators(self, field: tuple[int, int]) -> tuple[LowRank | Resampled, ...]:
+        """The operator of each camera over its field, from the object as it lies on the sensor.
+
+        On that of the largest distance; cameras at others interpolate it on their own scale.
+        """
         self.require("wavelength", "object_distance")
-        if np.ndim(self.object_distance) or max(distance_ratios(self.cameras)) > 1:
+        if np.ndim(self.object_distance):
             raise ValueError(
-                "PSFs of every point of the field are for one object_distance and for cameras at "
-                "one distance; give these, or leave field_tolerance out"
+                "PSFs over the field are for one object_distance; give one, or no field_tolerance"
             )
-        method = as_method(self.model, self.pixel_integration)
-        pairs = zip(self.cameras, self.wavelengths, strict=True)
-        return tuple(
-            field_fit(camera, [(light, 1.0)], self.object_distance, field, method).operator
-            for camera, light in pairs
-        )
+        method, distance = as_method(self.model, self.pixel_integration), self.object_distance
+        ratios, operators = distance_ratios(self.cameras), []
+        for camera, light, ratio in zip(self.cameras, self.wavelengths, ratios, strict=True):
+            own = own_field(field, ratio)
+            one = field_fit(camera, [(light, 1.0)], distance, own, method).operator
+            dtype, sizes = one.weights.dtype, zip(field, own, strict=True)
+            matrices = (_coarser(n, few, ratio).astype(dtype) for n, few in sizes)
+            operators.append(one if ratio == 1 else Resampled(one, *matrices))
+        return tuple(operators)
 
     def kernels(
         self, field: tuple[int, int], ratios: Sequence[float]
@@ -273,6 +278,13 @@ def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*
         antialias=False,
     )
     return enlarged
+
+
+def _coarser(count: int, few: int, ratio: float) -> Float[Array, "few count"]:
+    """Matrix from samples to those `ratio` times as far apart, about the same middle (Lanczos)."""
+    scale, start = jnp.asarray([1 / ratio]), jnp.asarray([(few - count / ratio) / 2])
+    shape, every = (few, count), jnp.eye(count)
+    return jax.image.scale_and_translate(every, shape, (0,), scale, start, method="lanczos5")
 
 
 def distance_ratios(cameras: Sequence[LenslessCamera]) -> list[float]:

@@ -8,6 +8,7 @@ from thincam_jax.imaging.operators.crop_convolution import kernel_shape as kerne
 from thincam_jax.imaging.operators.crop_convolution import window_shape as window_shape
 from thincam_jax.imaging.operators.low_rank import LowRank as LowRank
 from thincam_jax.imaging.operators.low_rank import LowRankFit as LowRankFit
+from thincam_jax.imaging.operators.low_rank import Resampled as Resampled
 from thincam_jax.imaging.operators.low_rank import low_rank_psf as low_rank_psf
 from thincam_jax.imaging.operators.low_rank import principal_psfs as principal_psfs
 from thincam_jax.imaging.operators.masked import Masked as Masked

@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
+from thincam_jax.imaging.operators.base import AbstractOperator, Shapes, real_numbers, require_shape
 from thincam_jax.imaging.operators.crop_convolution import (
     CropConvolution,
     cut,
@@ -61,6 +61,32 @@ class LowRank(AbstractOperator):
     def _norm(self, iterations, key, dtype):
         # PSFs are positive, so that a positive start image is near the top singular vector.
         return super()._norm(min(iterations, POSITIVE_ITERATIONS), key, dtype)
+
+
+class Resampled(AbstractOperator):
+    """An operator A of an image that is interpolated first: A (Y f Xᵀ).
+
+    - `operator`: A. `rows`, `columns`: Y and X.
+    """
+
+    operator: AbstractOperator
+    rows: Float[Array, "i m"]
+    columns: Float[Array, "j n"]
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.rows.shape[1], self.columns.shape[1]
+
+    @property
+    def out_shape(self) -> Shapes:
+        return self.operator.out_shape
+
+    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
+        require_shape("image", image, self.in_shape)
+        return self.operator(product(product(self.rows, image), self.columns.T))
+
+    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
+        return product(product(self.rows.T, self.operator.adjoint(capture)), self.columns)
 
 
 # Term by term: transforms of one window stay in a processor's cache, which is twice as fast.

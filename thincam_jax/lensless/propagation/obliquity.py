@@ -2,59 +2,19 @@
 
 import math
 import warnings
-from dataclasses import replace
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.grids import Grid
-from thincam_jax.lensless.masks.base import (
-    AbstractFactoredMask,
-    AbstractMask,
-    other_models,
-    term_count,
-)
-from thincam_jax.lensless.masks.pinhole import RadialMask
-from thincam_jax.lensless.method import (
-    SAMPLED,
-    AccuracyWarning,
-    Model,
-    PsfMethod,
-    as_method,
-    odd_from,
-)
+from thincam_jax.lensless.masks.base import AbstractMask, other_models
+from thincam_jax.lensless.method import SAMPLED, AccuracyWarning, Model
 from thincam_jax.lensless.propagation.path import Path
 
 # Relative L2 error of a zone plate's PSF for a radian of phase left out at the mask's edge.
 ERROR_PER_RADIAN = 0.22
 _LARGEST_ERROR = 0.05
-# Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
-_IN_CELL, _UNKNOWN_CELL = 16, 7
-
-
-def sampled_off_axis(
-    mask: AbstractMask, grid: Grid, path: Path, model: Model | PsfMethod
-) -> Model | PsfMethod:
-    """The model; in place of "separable" samples where a mask of edges alone has no closed form.
-
-    That is of rings off the axis, and of cells off both axes, whose integrals have no product.
-    Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an edge's wave, leave about 1 %.
-    """
-    method = as_method(model)
-    cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
-    beyond = path.skew and cells or path.at is not None and isinstance(mask, RadialMask)
-    if method.model != "separable" or not beyond:
-        return model
-    samples, light = _UNKNOWN_CELL, (path.wavelength, path.distance, path.object_distance)
-    if not any(map(checks.is_traced, jax.tree.leaves((mask, grid, light)))):
-        with jax.ensure_compile_time_eval():  # they are known under jit, too
-            zone = math.sqrt(path.wavelength * path.distance / path.magnification)
-            finest = mask.finest_frequency
-            cell = zone if finest is None else 0.5 / float(finest)
-            samples = odd_from(_IN_CELL * float(grid.pitch) / math.sqrt(cell * zone))
-    return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
 
 
 def require_off_axis(mask: AbstractMask, path: Path, model: Model) -> None:
