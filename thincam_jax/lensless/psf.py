@@ -48,7 +48,7 @@ from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommer
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
-from thincam_jax.lensless.propagation.skew import PIXEL_POINTS, skew_image
+from thincam_jax.lensless.propagation.skew import PIXEL_POINTS, focuses_on_a_line, skew_image
 from thincam_jax.lensless.sampling import require_phase_sampling
 
 # Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
@@ -235,15 +235,20 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
 def _sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> PsfMethod:
     """The method; in place of "separable" samples where a mask of edges has no closed form.
 
-    That is of rings off the axis, and of cells off both axes, whose integrals have no product.
-    Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an edge's wave, leave about 1 %.
+    That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
+    zones that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
+    edge's wave, leave about 1 %.
     """
     cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
     beyond = path.skew and cells or path.at is not None and mask.exact_model == "radial"
+    known = not any(map(checks.is_traced, jax.tree.leaves((mask, grid, replace(path, at=None)))))
+    if path.skew and known and not checks.is_traced(path.at):
+        with jax.ensure_compile_time_eval():
+            beyond = beyond or focuses_on_a_line(mask, path)
     if method.model != "separable" or not beyond:
         return method
-    samples, light = _UNKNOWN_CELL, (path.wavelength, path.distance, path.object_distance)
-    if not any(map(checks.is_traced, jax.tree.leaves((mask, grid, light)))):
+    samples = _UNKNOWN_CELL
+    if known:
         with jax.ensure_compile_time_eval():  # they are known under jit, too
             zone = math.sqrt(path.wavelength * path.distance / path.magnification)
             finest = mask.finest_frequency

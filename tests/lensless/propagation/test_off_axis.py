@@ -374,8 +374,11 @@ def test_steep_light_is_warned_of():
         tc.psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(60 * deg)))
 
 
-@pytest.mark.filterwarnings("ignore:at 16")
-def test_focus_off_both_axes_is_refused():
-    """Order −1 of β = 967 rad/mm² focuses on a sensor at 6.5 mm."""
+def test_zones_that_focus_off_both_axes_are_sampled():
+    """Order −1 of β = 62.83 rad/mm² focuses on a sensor at 100 mm; inside jit it is refused."""
+    at, given = (0.02, 0.02), {"beta": 62.83, "distance": 100.0, "object_distance": INF}
+    sampled = tc.PsfMethod("angular_spectrum", oversampling=61)
+    exact = tc.psf(camera_of(62.83, 100.0), wavelength=500 * nm, at=at, model=sampled)
+    assert relative(psf(at, **given), exact) < 0.01
     with pytest.raises(Exception, match="an order focuses nearly on the sensor; use 'angular"):
-        psf((0.2, 0.2), beta=940.0, object_distance=INF)
+        jax.jit(lambda y: psf((y, 0.02), **given))(0.02)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product
@@ -21,6 +21,24 @@ PIXEL_POINTS = 13
 _MOST_SHARED = 0.25
 # Of the interpolation across the shear.
 _NODES = 32
+
+
+def focuses_on_a_line(mask: AbstractMask, path: Path) -> bool:
+    """Whether `skew_image` refuses a point off both axes; of numbers that are known."""
+    zones, ray = zone_orders(mask), path.chief_ray(mask.centre)
+    return zones is not None and ray is not None and bool(_is_line(*_curvatures(zones, ray, path)))
+
+
+def _curvatures(zones, ray, path: Path):
+    """Entries (yy, xx, yx) of the matrix B, and kβ of the orders."""
+    b = path.fresnel_curvature * ray.cosine
+    matrix = (1 - ray.down**2) * b, (1 - ray.across**2) * b, -ray.down * ray.across * b
+    return matrix, jnp.asarray(zones.orders, zones.beta.dtype) * zones.beta
+
+
+def _is_line(matrix, curvatures) -> Bool[Array, ""]:
+    shared = matrix[2] ** 2 / ((curvatures + matrix[0]) * (curvatures + matrix[1]))
+    return jnp.max(jnp.abs(shared)) > _MOST_SHARED
 
 
 def skew_image(
@@ -45,8 +63,8 @@ def skew_image(
     Exact for a plate without edges and for one edge alone; what is approximated are the waves of
     the four corners: 0.2 % of the PSF at 20° and azimuth 45°, 0.4 % at 30° (β = 25 rad/mm²,
     5.632 mm, d = 6.5 mm). Where an order focuses into a line nearly along an axis the corners
-    count, and the numbers are refused (inside jit too). A pixel's average is the mean over `nodes`
-    points of it, None for its centre.
+    count, and the numbers are refused inside jit; outside, `psf` samples them. A pixel's average
+    is the mean over `nodes` points of it, None for its centre.
     """
     zones = zone_orders(mask)
     ray = path.chief_ray(mask.centre)
@@ -55,13 +73,10 @@ def skew_image(
             f"model 'separable' has a {type(mask).__name__} for points on one of its axes only; "
             "give at = (y, 0) or (0, x), or model = 'angular_spectrum'"
         )
-    b = path.fresnel_curvature * ray.cosine
-    matrix = (1 - ray.down**2) * b, (1 - ray.across**2) * b, -ray.down * ray.across * b
-    curvatures = jnp.asarray(zones.orders, zones.beta.dtype) * zones.beta
-    shared = matrix[2] ** 2 / ((curvatures + matrix[0]) * (curvatures + matrix[1]))
+    matrix, curvatures = _curvatures(zones, ray, path)
     curvatures = eqx.error_if(
         curvatures,
-        jnp.max(jnp.abs(shared)) > _MOST_SHARED,
+        _is_line(matrix, curvatures),
         "model 'separable' has no PSF for a point off both axes where an order focuses nearly on "
         "the sensor; use 'angular_spectrum'",
     )
