@@ -284,4 +284,9 @@ quoted = {
 }[SIZE]
 for name, levels in quoted.items():
     np.testing.assert_allclose([level for level, _ in rings[name]], levels, atol=0.15)
+if SIZE == "full":
+    finest = {
+        name: [round(pair, 2) for _, pair in rings[name]] for name in ("method A", "method B")
+    }
+    assert finest == {"method A": [1.98, 1.98, 2.22], "method B": [1.98, 2.22, 2.22]}
 assert change[2, 2] == 0 and change[2, 4] > 0.15 and change[0, 0] > change[2, 4]
