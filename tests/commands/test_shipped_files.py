@@ -106,6 +106,7 @@ def test_dry_run(path, tmp_path):
     assert not out.exists()
 
 
+@pytest.mark.thorough
 def test_dry_run_of_a_sweep(tmp_path):
     axis = "noise.snr_db=20,30,40"
     result = call(

@@ -68,6 +68,7 @@ def error_of_copies(problem, count):
     return float(eqx.filter_jit(lambda d: bayes_error(channels(d, *numbers)))(given.space.base))
 
 
+@pytest.mark.thorough
 def test_captures_share_the_exposure():
     """Two halves of an exposure are a whole one, but for the read noise of each."""
     errors = {}

@@ -79,6 +79,7 @@ def test_deepest_of_many(solver):
 RIPPLED = jnp.asarray([18.0, 24.0])
 
 
+@pytest.mark.thorough
 def test_improved_on_the_exact_objective():
     """`data` misplace the optimum by 4 rad/mm² in β₁; the exact objective has the ripples, too."""
     result = run(waves, RIPPLED + jnp.asarray([4.0, 0.0]), exact=RIPPLED)
@@ -133,6 +134,7 @@ def test_a_key_says_all():
     assert not np.array_equal(first.found[0].point, other.found[0].point)
 
 
+@pytest.mark.thorough
 @SOLVERS
 def test_other_values_do_not_compile_again(solver):
     traced = count_traces(waves)

@@ -77,6 +77,7 @@ def test_cells_hold_the_exact_average(shape, magnification):
     np.testing.assert_allclose(sampled, expected, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("moves", "magnification"), [((0.3, -0.9), -1.3), ((-0.2, -0.17), 0.9), ((0.3, 0.3), -0.4)]
 )

@@ -139,6 +139,7 @@ def test_the_shipped_denoiser_beats_a_linear_estimate(kind):
     assert found.status in ("converged", "iterations_exhausted")
 
 
+@pytest.mark.thorough
 def test_a_batch_is_reconstructed_as_its_images_are():
     seen, solver = recording(3), tc.PlugAndPlay(smooth, iterations=3)
     images = tc.reconstruct(seen, solver).image

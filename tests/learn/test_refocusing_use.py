@@ -114,6 +114,7 @@ def recording(distance: object = 80.0, **more):
     return tc.Recording([capture], cameras, noise_variance=1e-4, **more)
 
 
+@pytest.mark.thorough
 def test_it_is_a_solver():
     network = tiny.network()
     found = tc.reconstruct(recording(), Learned(network))

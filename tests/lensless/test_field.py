@@ -54,6 +54,7 @@ def test_every_point_has_its_own_psf(fit, place):
     assert error < 1e-2 * np.linalg.norm(whole)
 
 
+@pytest.mark.thorough
 def test_capture_over_the_field():
     """A scene whose pixels are the field's samples, of one point at its corner."""
     image = np.zeros(FIELD)

@@ -44,6 +44,7 @@ def test_pixels_answer_by_a_power_or_a_table():
     np.testing.assert_allclose(table, np.cos(angles) ** 4 * response, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_captures_and_their_operators_have_the_response():
     """One point at the corner of the field, with and without; the slope in the power."""
     image = np.zeros(FIELD)

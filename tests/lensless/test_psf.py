@@ -341,6 +341,7 @@ def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
     np.testing.assert_allclose(thin, wide[rows, columns], rtol=0, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_mask_wider_than_its_plane_inside_jit():
     """A traced width cannot choose the plane: that is the sensor's, too small for this mask."""
 

@@ -291,6 +291,7 @@ def whole_files(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
+@pytest.mark.thorough
 def test_file_cut_at_any_length_is_refused_in_one_line(tmp_path, caplog, capfd):
     caplog.set_level(logging.WARNING)
     for name, content in whole_files(tmp_path).items():
@@ -310,6 +311,7 @@ def test_file_cut_at_any_length_is_refused_in_one_line(tmp_path, caplog, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.thorough
 def test_changed_bytes_give_one_line_or_an_image(tmp_path, caplog, capfd):
     """A flipped byte may be a pixel; elsewhere it must not bring a traceback of a library."""
     generator = np.random.default_rng(3)

@@ -165,6 +165,7 @@ def test_the_inner_solve_follows_the_structure():
     assert type(splitting_of(case("masked").problem)).__name__ == "FourierSplitting"
 
 
+@pytest.mark.thorough
 def test_solvers_of_optimistix_take_the_problem():
     """LBFGS on a smooth problem, and the fixed point of ADMM's map, reach the same images."""
     given = case("small")

@@ -290,6 +290,7 @@ def test_with_a_proximal_map_in_closed_form_it_is_the_minimum_of_fista():
     assert relative_l2(image, own.image) < 1e-6
 
 
+@pytest.mark.thorough
 def test_the_implicit_derivative_is_that_of_differences():
     problem, truth = sparse(0.05)
 

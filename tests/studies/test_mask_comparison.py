@@ -14,6 +14,7 @@ from thincam_jax.studies import ComparedMask, ComparedScene
 from thincam_jax.studies.mask_captures import Seen, best_linear, capture
 
 
+@pytest.mark.thorough
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="masks: 1 are given; synthesis fringe_scanning takes 4"):
         ComparedMask((tiny.zones(),), synthesis="fringe_scanning")

@@ -111,6 +111,7 @@ def test_holograms_and_critical_angle_cut_the_band():
     assert 0.3 < float(part.weight[0, 0]) / 4.9e-6 < 0.8
 
 
+@pytest.mark.thorough
 def test_a_capture_is_the_sum_over_the_band():
     """Against 101 wavelengths of a coarse sensor, cells averaged by many points."""
     sensor = tc.Sensor((5, 6), 360 * um)

@@ -130,6 +130,7 @@ def test_a_store_is_not_written_over_and_a_missing_one_not_resumed(method_b, tmp
     assert call("capture", file, "--out", store, "--resume").exit_code == 0  # complete already
 
 
+@pytest.mark.thorough
 def test_after_ctrl_c_the_store_is_kept_and_goes_on(method_b, tmp_path, monkeypatch):
     """With the same frames as a capture that was not interrupted."""
     file, whole = method_b
@@ -156,6 +157,7 @@ def test_after_ctrl_c_the_store_is_kept_and_goes_on(method_b, tmp_path, monkeypa
     assert all(np.array_equal(first.frame(n), second.frame(n)) for n in lit[1:])
 
 
+@pytest.mark.thorough
 def test_the_exposure_is_found_before_the_first_frame_and_kept(tmp_path):
     """From three times too long a start; the same when it goes on."""
     raw = yaml.safe_load(tiny.METHOD_B) | {"acquisition": {"exposure": "auto"}}

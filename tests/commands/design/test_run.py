@@ -54,6 +54,7 @@ def test_a_longer_search_finds_no_worse(whole, tmp_path):
     assert stored(tmp_path / "out") == design
 
 
+@pytest.mark.thorough
 def test_what_is_printed(whole):
     """A row for each design that is simulated; a chart that is not resolved has no gain."""
     path, design, text = whole

@@ -212,6 +212,7 @@ class TestFolder:
         folder.mkdir()
         return {**simulated.grey_files(folder, self.NAMES), "capture": folder}
 
+    @pytest.mark.thorough
     def test_one_that_fails_is_told_and_the_others_go_on(self, paths, tmp_path):
         """The PSF and the dark frame in the folder are no captures."""
         paths["b"].write_bytes(paths["b"].read_bytes()[:4000])

@@ -66,6 +66,7 @@ def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
     assert told == found
 
 
+@pytest.mark.thorough
 def test_a_file_of_a_full_colour_hologram(tmp_path):
     overrides = (
         "hologram.wavelength=null",

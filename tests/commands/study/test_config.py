@@ -315,6 +315,7 @@ CURVATURES = st.floats(1e-7, 1e7)
 WAVELENGTHS, PITCHES = st.floats(1e-4, 0.1), st.floats(1e-4, 1.0)
 
 
+@pytest.mark.thorough
 @settings(max_examples=12, deadline=None)
 @given(
     WAVELENGTHS,

@@ -69,6 +69,7 @@ def test_a_killed_run_is_resumed(kills, count, kept, tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("done", quick([3, 9], 1))  # before and after the first given position
 def test_a_stage_that_stays_is_moved_back_by_a_new_process(done, tmp_path):
     """The resumed process finds the stage homed, at 0, and not where the last step left it."""

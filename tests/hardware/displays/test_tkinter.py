@@ -38,6 +38,7 @@ with open_device("displays", "tkinter", options) as display:
 """
 
 
+@pytest.mark.thorough
 @needs_x_server
 @pytest.mark.parametrize("options", [{}, {"left": 30, "top": 20, "size": (24, 40)}])
 def test_no_wrong_pixel_on_an_x_server(options):

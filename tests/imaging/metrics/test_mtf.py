@@ -299,6 +299,7 @@ def independent_response(beta, distance, phases, weights, *, shape, pitch):
     return (np.exp(-2j * np.pi * np.outer(u, columns)) @ total) * pitch**2
 
 
+@pytest.mark.thorough
 def test_responses_against_an_independent_evaluation():
     """Both kinds of synthesis, on a sensor that is not square and has no pixel average."""
     shape, pitch = (600, 1024), 5.5e-3

@@ -56,6 +56,7 @@ def test_a_coarse_tolerance_takes_a_cheaper_model(deep):
     assert not plan.method.pixel_integration
 
 
+@pytest.mark.thorough
 def test_double_precision_where_single_cannot_serve():
     """At 1e-8 everything is computed, in float64 though the camera is in float32."""
     own, few = camera(np.float32), scene(2, 2, dtype=np.float32)
@@ -70,6 +71,7 @@ def test_double_precision_where_single_cannot_serve():
     ).meets_tolerance  # the result is float32
 
 
+@pytest.mark.thorough
 def test_equal_planes_merge_into_one():
     one = scene(1, 1).planes[0]
     other = tc.ImagePlane(one.image[::-1], one.distance, one.width)
@@ -172,6 +174,7 @@ def test_noise_is_added_to_a_planned_capture(key):
     assert 1e-3 < relative_l2(noisy, clean) < 1e-1
 
 
+@pytest.mark.thorough
 def test_a_plan_is_not_run_on_another_scene():
     plan = tc.plan(camera(), scene(2, 2), tolerance=0.1)
     with pytest.raises(ValueError, match=r"for 2 planes at given distances.*make a plan"):

@@ -238,6 +238,7 @@ def test_on_the_axis_it_is_the_psf_of_the_axis(distance):
     assert relative(psf((0.0, 0.0), object_distance=distance), expected) < 1e-12
 
 
+@pytest.mark.thorough
 def test_cells_are_continuous_at_the_axis_and_have_slopes():
     """Against a difference, of a point along the axis that is traced."""
     camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
@@ -258,6 +259,7 @@ def test_a_point_behind_the_mask_is_refused():
         tc.psf(camera_of(), wavelength=500 * nm, object_distance=-10.0, at=(0.0, 1.0))
 
 
+@pytest.mark.thorough
 def test_along_an_axis_both_forms_agree():
     """That of products, and that of a point which may be anywhere."""
     for at in ((0.0, 20.0), (-30.0, 0.0)):
@@ -295,6 +297,7 @@ def test_slopes():
             np.testing.assert_allclose(slope(numbers)[k], difference, rtol=2e-4, atol=2e-6)
 
 
+@pytest.mark.thorough
 def test_batches_and_new_values_are_one_program():
     points = jnp.asarray([[12.0, 21.0], [0.0, -5.0], [3.0, 0.0]])
     counted = count_traces(psf)

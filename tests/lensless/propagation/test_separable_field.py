@@ -67,6 +67,7 @@ def test_lattice(count):
     np.testing.assert_allclose(points[::-1], -points, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_slopes_and_batches():
     """In distance, light and cells, against finite differences; no new program for new values."""
     mask, grid, path = parts_of(MASKS["wide"])
