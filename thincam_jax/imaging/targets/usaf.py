@@ -65,7 +65,7 @@ def usaf1951_elements(layers: int = 3, first_group: int = -2) -> tuple[UsafEleme
 
     Raises ValueError for less than one layer or an odd `first_group`.
     """
-    checks.whole("layers", layers, 1, 100)
+    layers = checks.whole("layers", layers, 1, 100)
     if checks.whole("first_group", first_group, -100, 100) % 2:
         raise ValueError(
             f"first_group = {first_group!r} is not an even whole number; a layer begins with an "
@@ -109,7 +109,7 @@ def usaf1951(
     Raises ValueError for a shape, layers, polarity or size that makes no chart.
     """
     rows, columns = checks.shape2d("shape", shape)
-    checks.whole("layers", layers, 1, 100)
+    layers = checks.whole("layers", layers, 1, 100)
     checks.choice("polarity", polarity, POLARITIES)
     width = min(rows, columns) if pixels_per_chart is None else pixels_per_chart
     checks.positive("pixels_per_chart", width, "pixels")
