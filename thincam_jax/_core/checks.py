@@ -49,6 +49,11 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, Tracer)
 
 
+def holds_traced(*values: Any) -> bool:
+    """Whether a leaf of the values, pytrees, is not known yet."""
+    return any(map(is_traced, jax.tree.leaves(values)))
+
+
 def _known(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is traced; of type object for what is none."""
     try:
@@ -112,7 +117,7 @@ def as_array(value: Any, *, floating: bool = False) -> Array:
     if isinstance(value, jax.Array):
         if not value.weak_type and not (floating and value.dtype.kind in "iub"):
             return value
-    elif not any(map(is_traced, jax.tree.leaves(value))):
+    elif not holds_traced(value):
         known = np.asarray(value)
         if floating and known.dtype.kind in "iub":
             known = known.astype(float)
@@ -140,7 +145,7 @@ def numbers(name: str, value: Any, *, allow_complex: bool = False) -> np.ndarray
 
 def array(name: str, value: Any, *, allow_complex: bool = False) -> Array:
     """`numbers` for JAX, of traced ones, too."""
-    if isinstance(value, jax.Array) or any(map(is_traced, jax.tree.leaves(value))):
+    if isinstance(value, jax.Array) or holds_traced(value):
         known = jnp.asarray(value)
         _require_numbers(name, value, known.dtype, allow_complex)
         return known

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -105,7 +104,7 @@ def field_fit(
         own = spectral_psf(camera, colours, object_distance, method, grid)
         axis = CropConvolution(own[None], sensor.pitch, sensor.shape, field_shape, summed=1)
         return LowRankFit(LowRank(jnp.asarray(fall[None], own.dtype), axis), 1.0, 0.0)
-    if any(map(checks.is_traced, jax.tree.leaves((camera, colours, object_distance)))):
+    if checks.holds_traced(camera, colours, object_distance):
         raise TypeError(
             "the PSFs of every point of the field need known numbers: call it outside of jit and "
             "grad, or give field_tolerance = 1 (the light of every point, the PSF of the axis)"

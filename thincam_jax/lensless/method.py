@@ -216,7 +216,7 @@ def odd_from(number: float) -> int:
 
 def _mask_plane(mask: AbstractMask, grid: Grid) -> tuple[int, int] | None:
     """Pixels that hold the mask; None for a traced size: then the sensor's, checked when run."""
-    known = not any(map(checks.is_traced, jax.tree.leaves(mask)))
+    known = not checks.holds_traced(mask)
     with jax.ensure_compile_time_eval() if known else nullcontext():  # known under jit, too
         sizes = [*mask.extent, grid.pitch, mask.centre]
     if any(checks.is_traced(s) for s in sizes):

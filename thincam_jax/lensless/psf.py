@@ -239,16 +239,14 @@ def _sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMet
     zones that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
     edge's wave, leave about 1 %.
     """
+    if method.model != "separable" or path.at is None:
+        return method
     cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
-    beyond = path.skew and cells or path.at is not None and mask.exact_model == "radial"
-    known = not any(map(checks.is_traced, jax.tree.leaves((mask, grid, replace(path, at=None)))))
-    if path.skew and known and not checks.is_traced(path.at):
-        with jax.ensure_compile_time_eval():
-            beyond = beyond or focuses_on_a_line(mask, path)
-    if method.model != "separable" or not beyond:
+    beyond = path.skew and (cells or focuses_on_a_line(mask, path))
+    if not (beyond or mask.exact_model == "radial"):
         return method
     samples = _UNKNOWN_CELL
-    if known:
+    if not checks.holds_traced(mask, grid, replace(path, at=None)):
         with jax.ensure_compile_time_eval():  # they are known under jit, too
             zone = math.sqrt(path.wavelength * path.distance / path.magnification)
             finest = mask.finest_frequency

@@ -58,7 +58,7 @@ def warn_if_unresolved(camera: LenslessCamera, distances: Iterable[Any]) -> None
     Masks that do not know their `finest_frequency`, and numbers under jit, pass.
     """
     distances = list(distances)
-    known = not any(map(checks.is_traced, jax.tree.leaves((camera, distances))))
+    known = not checks.holds_traced(camera, distances)
     finest = camera.mask.finest_frequency if known else None
     if finest is not None and not checks.is_traced(finest):
         farthest = max(float(distance) for distance in distances)
@@ -80,7 +80,7 @@ def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: P
     `angular_spectrum` it misses the sensor. Wavelengths outside the material's band are refused,
     too. Masks of other kinds and traced numbers pass.
     """
-    known = not any(map(checks.is_traced, jax.tree.leaves((mask, grid, path))))
+    known = not checks.holds_traced(mask, grid, path)
     if not isinstance(mask, PhaseMask) or method.oversampling is None or not known:
         return
     wavelength = float(path.wavelength)

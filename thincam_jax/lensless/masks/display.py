@@ -82,7 +82,7 @@ def on_display(mask: AbstractMask, pixel_pitch: Number, fill_factor: Number = 1.
     """
     pitch = checks.positive("pixel_pitch", pixel_pitch, "mm")
     fill = checks.fraction("fill_factor", fill_factor)
-    if any(map(checks.is_traced, jax.tree.leaves((mask, pitch)))):
+    if checks.holds_traced(mask, pitch):
         raise TypeError("on_display needs a mask of known size and pitch: call it outside of jit")
     with jax.ensure_compile_time_eval():  # they are known under jit, too
         sides = tuple(zip(("height", "width"), mask.extent, strict=True))

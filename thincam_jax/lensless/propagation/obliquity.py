@@ -29,7 +29,7 @@ def require_off_axis(mask: AbstractMask, path: Path, model: Model) -> None:
             f"model {model!r} is for points on the axis: leave `at` out, or use "
             + (other_models(mask) if model != "radial" else "'angular_spectrum'")
         )
-    if any(map(checks.is_traced, jax.tree.leaves((mask, path)))):
+    if checks.holds_traced(mask, path):
         return
     with jax.ensure_compile_time_eval():
         finest = mask.finest_frequency

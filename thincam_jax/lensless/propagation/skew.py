@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product
 from thincam_jax.lensless.masks.base import AbstractMask, zone_orders
@@ -24,9 +25,12 @@ _NODES = 32
 
 
 def focuses_on_a_line(mask: AbstractMask, path: Path) -> bool:
-    """Whether `skew_image` refuses a point off both axes; of numbers that are known."""
-    zones, ray = zone_orders(mask), path.chief_ray(mask.centre)
-    return zones is not None and ray is not None and bool(_is_line(*_curvatures(zones, ray, path)))
+    """Whether `skew_image` refuses a point off both axes; False where that is not known yet."""
+    if checks.holds_traced(mask, path):
+        return False
+    with jax.ensure_compile_time_eval():
+        zones, ray = zone_orders(mask), path.chief_ray(mask.centre)
+        return zones is not None and bool(_is_line(*_curvatures(zones, ray, path)))
 
 
 def _curvatures(zones, ray, path: Path):
