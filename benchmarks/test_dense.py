@@ -21,7 +21,8 @@ import thincam_jax as tc
 from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.reconstruction.problem import compiled_objective
 
-PIXELS, CELLS = (440, 64) if os.environ.get("THINCAM_DENSE") == "full" else (96, 24)
+FULL = os.environ.get("THINCAM_DENSE") == "full"
+PIXELS, CELLS = (440, 64) if FULL else (96, 24)
 ITERATIONS, CHUNK, ROUNDS = 100, 10, 7
 # Penalties relative to the mean eigenvalue of HᵀH, and relaxations.
 TUNED = tuple(itertools.product(np.geomspace(0.03, 30, 13), (1.0, 1.8)))
@@ -92,7 +93,7 @@ def test_seconds_to_equal_objective_against_numpy(capsys):
         print("  iteration   objective     NumPy's")
         for number, pair in enumerate(zip(found, courses[best], strict=True), 1):
             print(f"  {CHUNK * number:9d} {pair[0]:11.6g} {pair[1]:11.6g}")
-    assert found[-1] < 1.003 * courses[best][-1]
+    assert found[-1] < (1.003 if FULL else 1.001) * courses[best][-1]
 
 
 def timed(function):

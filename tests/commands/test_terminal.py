@@ -15,6 +15,9 @@ from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 
 EVIL = "\x1b[31m\x07\u202e[/red]\x9b\r\u2028"
+METHOD = (
+    "{name: a, kind: wiener, synthesis: separate, shots: [{beta: 25 rad/mm^2, distance: 3 mm}]}"
+)
 IN_YAML = '"' + EVIL.encode("unicode_escape").decode() + '"'
 
 
@@ -132,34 +135,36 @@ def test_a_near_miss_is_told_what_to_write(line, advice, tmp_path):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("line", "advice", "followed"),
+    ("line", "wrong", "advice", "right"),
     [
-        ("explain FILE --set mask.width=2", 'a length such as "180 mm"', "mask.width=180mm"),
-        ("explain FILE --set mask.widht=2mm", "allowed here: width, ", "mask.width=2mm"),
-        ("explain FILE --set wavelength=532mm", "give 10 nm to 0.1 mm", "wavelength=10nm"),
-        ("explain FILE --set model=seperable", "'closed_form', 'separable'", "model=separable"),
-        ("explain FILE --set methods=1", "write it as [a, b]", None),
-        ("explain FILE --set seed=1.5", "input should be a valid integer", "seed=1"),
-        ("sweep FILE --grid seed=1,1 --dry-run", "give each once", "seed=1,2"),
-        ("sweep FILE --grid seed=1:3:0 --dry-run", "give from 1 to 100000 values", "seed=1:3:1"),
-        ("sweep FILE --grid seed=1,2 --dry-run --workers 0", "give at least 1", "1"),
-        ("design FILE --dry-run", "is a study; give it to 'thincam run'", "run FILE --dry-run"),
+        ("explain FILE --set {}", "mask.width=2", 'a length such as "180 mm"', "mask.width=180mm"),
+        ("explain FILE --set {}", "mask.widht=2mm", "allowed here: width, ", "mask.width=2mm"),
+        ("explain FILE --set {}", "wavelength=532mm", "give 10 nm to 0.1 mm", "wavelength=10nm"),
+        (
+            "explain FILE --set {}",
+            "model=seperable",
+            "'closed_form', 'separable'",
+            "model=separable",
+        ),
+        ("explain FILE --set {}", "methods=1", "write it as [a, b]", f"methods=[{METHOD}]"),
+        ("explain FILE --set {}", "seed=1.5", "input should be a valid integer", "seed=1"),
+        ("sweep FILE --grid {} --dry-run", "seed=1,1", "give each once", "seed=1,2"),
+        (
+            "sweep FILE --grid {} --dry-run",
+            "seed=1:3:0",
+            "give from 1 to 100000 values",
+            "seed=1:3:1",
+        ),
+        ("sweep FILE --grid seed=1,2 --dry-run --workers {}", "0", "give at least 1", "1"),
+        ("{} FILE --dry-run", "design", "is a study; give it to 'thincam run'", "run"),
     ],
 )
-def test_what_a_line_advises_can_be_followed(line, advice, followed, tmp_path):
-    """`followed` stands in place of the last word, or is a line of its own."""
-    file = mini.write(tmp_path)
+def test_what_a_line_advises_can_be_followed(line, wrong, advice, right, tmp_path):
+    file = str(mini.write(tmp_path))
 
-    def started(line):
-        return call(*(str(file) if word == "FILE" else word for word in line.split()))
+    def started(value):
+        return call(*(word.replace("FILE", file).format(value) for word in line.split()))
 
-    assert advice in one_line(started(line))
-    if followed is None:
-        return
-    if "FILE" not in followed:
-        words = line.split()
-        place = next(i for i, w in enumerate(words) if w in ("--set", "--grid")) + 1
-        words[-1 if "--workers" in words else place] = followed
-        followed = " ".join(words)
-    end = started(followed)
+    assert advice in one_line(started(wrong))
+    end = started(right)
     assert end.exit_code == 0, end.output
