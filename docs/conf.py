@@ -128,7 +128,7 @@ def reference_page(package: str, seen: set[tuple[str, str]]) -> str:
     groups: dict[str, list[str]] = {title: [] for title in ROOMS.values() if package == TOP}
     for node in source(package).body:
         if isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:
+            for alias in (one for one in node.names if one.asname):  # `x as x`: public
                 module = f"{package}.{node.module}" if node.level else node.module
                 named = getattr(importlib.import_module(package), alias.name)
                 module = getattr(named, "__module__", module)

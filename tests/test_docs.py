@@ -98,7 +98,7 @@ def test_real_captures_page(tmp_path, monkeypatch, capsys):
     assert "(3, 30, 38)" in printed
     assert "nan" not in printed
     ready, image = names["ready"], np.asarray(names["result"].image)
-    assert ready.log["background"]["capture"]["kind"] == "dark frame dark.tif"
+    assert ready.log.capture.background == "dark frame dark.tif"
     truth = simulated.scene().reshape(3, 30, 2, 38, 2).mean(axis=(2, 4))
     for channel, expected in zip(image, truth, strict=True):
         assert simulated.correlation(channel, expected) > 0.9

@@ -20,7 +20,7 @@ from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
-from thincam_jax.learn.refocusing.sources import drawn
+from thincam_jax.learn.refocusing.sources import as_json, drawn
 from thincam_jax.learn.refocusing.store import (
     _SHIPPED_FILE,
     SHIPPED,
@@ -38,7 +38,7 @@ from thincam_jax.units import nm, um
 def file(tmp_path_factory):
     """An untrained network in a file."""
     path = tmp_path_factory.mktemp("network") / NETWORK
-    return save(path, tiny.network(), tiny.lessons().manifest())
+    return save(path, tiny.network(), {"images": as_json(tiny.lessons().images)})
 
 
 @pytest.mark.thorough

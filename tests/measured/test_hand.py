@@ -32,9 +32,9 @@ def test_preparation_agrees_with_the_tutorial_steps(raws):
     background = psf[5:15, 5:15].mean()
     assert found.psf.shape == found.capture.shape == (1, 300, 400)
     for name in ("psf", "capture"):
-        record = found.log["background"][name]
-        assert record["kind"] == "corner"
-        np.testing.assert_allclose(record["level"], [background / 65535], rtol=1e-6)
+        record = getattr(found.log, name)
+        assert record.background == "corner"
+        np.testing.assert_allclose(record.level, [background / 65535], rtol=1e-6)
     psf, capture = (
         skimage.transform.downscale_local_mean(np.maximum(image - background, 0), (4, 4))
         for image in (psf, capture)
@@ -47,11 +47,11 @@ def test_preparation_agrees_with_the_tutorial_steps(raws):
 def test_saturated_pixels_of_the_psf_show_in_the_log(raws):
     """Its 12 bits stand at the upper end of 16, so they end at 65520 and not at 65535."""
     log = prepare(*raws, options=Preparation(downsample=4)).log
-    assert log["validity"]["psf"]["saturated"] == 0
-    assert log["full_scale"]["psf"]["maximum"] == 4095 * 16
-    assert log["full_scale"]["psf"]["pixels_at_maximum"] == 192
+    assert log.psf.saturated == 0
+    assert log.psf.maximum == 4095 * 16
+    assert log.psf.pixels_at_maximum == 192
     log = prepare(*raws, options=Preparation(downsample=4, saturation=0.9997)).log
-    assert log["validity"]["psf"]["saturated"] == 192
+    assert log.psf.saturated == 192
 
 
 def test_stamp_in_the_first_two_pixels_is_left_out_as_dead(raws):
@@ -72,8 +72,8 @@ def test_stamp_in_the_first_two_pixels_is_left_out_as_dead(raws):
 
 def test_noise_clean_up_removes_little_light(raws):
     log = prepare(*raws, options=Preparation(downsample=4, noise_threshold=3)).log
-    assert log["clean_up"]["zeroed"] > 10_000
-    assert log["clean_up"]["light_removed"] < 1e-3
+    assert log.clean_up.zeroed > 10_000
+    assert log.clean_up.light_removed < 1e-3
 
 
 def test_picture_in_the_folder_is_no_capture(folder):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -37,13 +38,12 @@ def test_one_channel_with_the_corner_as_background():
     image = blocks(np.maximum(capture - level, 0), 4) / 4095
     np.testing.assert_allclose(found.psf[0], unit_sum(light), rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(found.capture[0], image / image.max(), rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(found.log["scaling"]["capture_divisor"], image.max(), rtol=1e-6)
+    np.testing.assert_allclose(found.log.capture_divisor, image.max(), rtol=1e-6)
     assert found.psf.dtype == found.capture.dtype == np.float32
     assert found.valid.all() and found.valid.shape == (1, 6, 9)
-    record = found.log["background"]["capture"]
-    np.testing.assert_allclose(record["level"], [level / 4095], rtol=1e-6)
+    np.testing.assert_allclose(found.log.capture.level, [level / 4095], rtol=1e-6)
     clipped = [int((a < level).sum()) for a in (psf, capture)]
-    assert [found.log["clipping"][n] for n in ("psf", "capture")] == clipped
+    assert [one.clipped for one in (found.log.psf, found.log.capture)] == clipped
     assert min(clipped) > 0
 
 
@@ -59,7 +59,7 @@ def test_dark_frames_and_numbers():
     expected = np.maximum(capture.astype(float) - 50, 0) / 4095
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(found.psf[0], unit_sum(psf.astype(float)), rtol=1e-5)
-    assert found.log["background"]["psf"] == {"kind": "number", "level": [0.0]}
+    assert found.log.psf.background == "number" and found.log.psf.level == (0.0,)
 
 
 def test_raw_data_are_left_as_they_were():
@@ -99,9 +99,7 @@ def test_one_psf_for_all_channels():
     advised = prepare(
         Raw(psf, 12), Raw(capture[..., 0], 12), None, Preparation(psf_channels="mean")
     )
-    assert advised.log["background"]["capture"]["level"] == [
-        pytest.approx(np.mean(advised.log["background"]["psf"]["level"]))
-    ]
+    assert list(advised.log.capture.level) == [pytest.approx(np.mean(advised.log.psf.level))]
 
 
 def test_bayer_superpixel_and_blocks_are_plain_means():
@@ -127,8 +125,8 @@ def test_saturated_pixels_spoil_all_that_they_enter():
     expected = np.zeros((3, ROWS, COLUMNS), bool)  # (5, 9) is blue
     expected[2, 4:7, 8:11] = True
     np.testing.assert_array_equal(~found.valid, expected)
-    assert found.log["validity"]["capture"]["saturated"] == 1
-    np.testing.assert_allclose(found.log["validity"]["valid_share"], 1 - 9 / expected.size)
+    assert found.log.capture.saturated == 1
+    np.testing.assert_allclose(found.log.valid_share, 1 - 9 / expected.size)
 
 
 def test_saturation_below_full_scale_and_of_floats():
@@ -156,7 +154,7 @@ def test_dead_pixels_are_left_out_of_means():
     # The block that nobody measured is a copy of one of its four neighbours.
     neighbours = [found.capture[0, *place] for place in ((1, 5), (3, 5), (2, 4), (2, 6))]
     assert found.capture[0, 2, 5] in neighbours
-    assert found.log["validity"]["capture"]["dead"] == 17
+    assert found.log.capture.dead == 17
     assert found.psf[0, 2, 5] in [found.psf[0, *p] for p in ((1, 5), (3, 5), (2, 4), (2, 6))]
 
 
@@ -178,8 +176,7 @@ def test_odd_sides_are_cropped_centrally():
     found = prepare(Raw(psf, 12), Raw(capture, 12), 0, options)
     expected = blocks(capture[1:25, 1:37].astype(float), 4) / 4095
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5)
-    record = found.log["downsampling"]
-    assert record["first_pixel"] == [1, 1] and record["cropped_to"] == [24, 36]
+    assert found.log.first_pixel == (1, 1) and found.log.cropped_to == (24, 36)
 
 
 def test_noise_of_the_corner_sets_the_threshold():
@@ -190,7 +187,7 @@ def test_noise_of_the_corner_sets_the_threshold():
     options = Preparation(downsample=2, noise_threshold=5, corner=(0, 40))
     found = prepare(Raw(psf), Raw(psf), options=options)
     # Of 1600 samples: 2 % standard error.
-    np.testing.assert_allclose(found.log["clean_up"]["noise"], [0.005], rtol=0.08)
+    np.testing.assert_allclose(found.log.noise, [0.005], rtol=0.08)
     assert np.argwhere(found.psf[0]).min(axis=0).tolist() == [25, 35]
     assert np.count_nonzero(found.psf) == 5 * 10
     # A mosaic's colours may differ in level without that being noise.
@@ -198,7 +195,7 @@ def test_noise_of_the_corner_sets_the_threshold():
     mosaic = prepare(
         Raw(psf), Raw(psf), 0, Preparation(bayer="RGGB", noise_threshold=5, corner=(0, 40))
     )
-    np.testing.assert_allclose(mosaic.log["clean_up"]["noise"], [0.01], rtol=0.08)
+    np.testing.assert_allclose(mosaic.log.noise, [0.01], rtol=0.08)
 
 
 def test_centring_shifts_all_channels_alike():
@@ -206,21 +203,19 @@ def test_centring_shifts_all_channels_alike():
     psf[18, 20], psf[19, 20, 2] = 3000, 3500
     capture = measured(3, seed=12)
     found = prepare(Raw(psf, 12), Raw(capture, 12), 10, Preparation(centre="peak"))
-    assert found.log["centring"]["shift"] == [-6, -2]
+    assert found.log.centring.shift == (-6, -2)
     assert np.argwhere(found.psf[0]).tolist() == [[12, 18]]
     assert np.argwhere(found.psf[2]).tolist() == [[12, 18], [13, 18]]
 
 
-def test_the_log_names_every_step_and_is_plain_json():
+def test_the_log_is_plain_json():
     psf, capture = measured(3), measured(3, seed=12)
     options = Preparation(centre="centroid", threshold=0.01, downsample=2)
     log = prepare(Raw(psf, 12), Raw(capture, 12), options=options).log
-    assert set(log) == {"options", "order", *log["order"]}
-    assert log["order"][:4] == ["full_scale", "background", "clipping", "validity"]
-    assert log["order"][-1] == "scaling" and len(log["order"]) == 11
-    assert json.loads(json.dumps(log, allow_nan=False)) == json.loads(log_text(log))
-    at_maximum = log["full_scale"]["psf"]["pixels_at_maximum"]
-    assert at_maximum == (psf == psf.max()).sum()
+    written = json.loads(json.dumps(asdict(log), allow_nan=False))
+    assert written == json.loads(log_text(log))
+    assert written["options"]["downsample"] == 2 and written["centring"]["shift"] == [-1, -2]
+    assert log.psf.pixels_at_maximum == (psf == psf.max()).sum()
 
 
 def refused(message, psf, capture, *arguments, **keywords):
@@ -299,7 +294,7 @@ def test_psf_of_other_pixels_is_brought_to_the_captures(shape, pitch):
     whole = [max(n, int(k * pitch)) for n, k in zip((ROWS, COLUMNS), shape, strict=True)]
     assert found.capture.shape == (1, ROWS, COLUMNS) and found.psf.shape == (1, *whole)
     expected = blob(found.psf.shape[1:], 1.0).pixels.astype(float)
-    assert found.log["order"].index("resampling") < found.log["order"].index("downsampling")
+    assert found.log.psf_shape == tuple(whole)
     light = unit_sum(expected)
     assert np.abs(found.psf[0] - light).max() < 0.03 * light.max()
 

@@ -26,7 +26,7 @@ def test_noise_in_counts_of_a_raw_pixel(prepared):
     assert given.counts == pytest.approx(NOISE) and given.found == "given"
     assert found.counts == pytest.approx(NOISE, rel=0.25) and found.found.startswith("estimated")
     assert found.deviation / found.counts == pytest.approx(given.deviation / given.counts)
-    scale = 4095 * prepared.log["scaling"]["capture_divisor"]
+    scale = 4095 * prepared.log.capture_divisor
     assert given.deviation == pytest.approx(NOISE / scale)
 
 

@@ -1,9 +1,8 @@
 """Preparation of a measured PSF and a capture for a reconstruction."""
 
-import dataclasses
 import math
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -13,6 +12,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import demosaic, demosaic_mask
 from thincam_jax.measured.options import Centre, Preparation, check_match
+from thincam_jax.measured.preparation_log import Centring, CleanUp, ImageLog, PreparationLog
 from thincam_jax.measured.raw import MeasurementError, Raw
 
 Background = Raw | float | int | Literal["corner"]
@@ -24,15 +24,15 @@ class Prepared:
 
     - `psf`: one channel, or one for each of the capture's; sums to 1 (`psf_sum`). It is whole, and
       so may have more pixels than the capture.
-    - `capture`: in fractions of full scale divided by `log["scaling"]["capture_divisor"]`.
+    - `capture`: in fractions of full scale divided by `log.capture_divisor`.
     - `valid`: False where the capture is saturated or dead.
-    - `log`: record of all steps for a JSON file; `log["order"]` lists them.
+    - `log`: what the steps did.
     """
 
     psf: Float32[np.ndarray, "psf_channel k l"]
     capture: Float32[np.ndarray, "channel y x"]
     valid: Bool[np.ndarray, "channel y x"]
-    log: dict[str, Any]
+    log: PreparationLog
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,11 @@ class _Frame:
     values: np.ndarray  # (channel, y, x) float32
     saturated: np.ndarray  # bool
     known: np.ndarray  # bool; False where only dead pixels contribute
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self.values.shape[-2:]
+        return rows, columns
 
 
 @checked
@@ -56,25 +61,24 @@ def prepare(
 ) -> Prepared:
     """Convert a measured PSF and a capture to linear units, cleaned and resampled.
 
-    The steps, each recorded in the result's `log`:
+    The steps, of which the result's `log` tells:
 
-    1. `full_scale`: counts to fractions of full scale, float32.
-    2. `background`: subtract a dark frame (of the image's exposure), a number of counts, or
+    1. Counts to fractions of full scale, float32.
+    2. Background: subtract a dark frame (of the image's exposure), a number of counts, or
        "corner", the default: the mean of a square in the PSF's upper left corner, for both images,
        because a lensless capture has no dark place. 0 subtracts nothing. `psf_background` is that
-       of the PSF where it differs.
-    3. `clipping`: negative values become 0.
-    4. `validity`: saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x)
-       of the sensor (`read_mask`).
-    5. `demosaicing`, if the options name a Bayer pattern; then the capture's `crop`.
-    6. `resampling` of the PSF onto the capture's pixels, with `psf_scale`.
-    7. `downsampling`: exact means of square blocks; remainders are cropped centrally.
-    8. `clean_up` of the PSF, optional.
-    9. `centring` of the PSF, optional.
-    10. `channels`: one PSF for all, optional.
-    11. `scaling`: the PSF to unit sum, the capture by `capture_scale`.
+       of the PSF where it differs. Negative values become 0.
+    3. Saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x) of the sensor
+       (`read_mask`), are not valid.
+    4. Demosaicing, if the options name a Bayer pattern; then the capture's `crop`.
+    5. The PSF onto the capture's pixels, with `psf_scale`.
+    6. Exact means of square blocks of `downsample` pixels; remainders are cropped centrally.
+    7. Small values of the PSF to zero, optional.
+    8. The PSF to the middle of its array, optional.
+    9. One PSF for all channels, optional.
+    10. The PSF to unit sum, the capture by `capture_scale`.
 
-    In 5 and 7 dead pixels are left out of the means, as they are missing at random; a value without
+    In 4 and 6 dead pixels are left out of the means, as they are missing at random; a value without
     any good pixel is invalid and copied from the nearest good one. A saturated pixel invalidates
     every value that it enters, because a mean of the others would be too dark. Saturated pixels of
     the PSF are only counted in the log; they call for a PSF of shorter exposure.
@@ -90,7 +94,6 @@ def prepare(
     }
     raws = {"psf": psf, "capture": capture}
     check_match(psf, capture, backgrounds, dead, options)
-    log: dict[str, Any] = {"full_scale": {name: _facts(raw) for name, raw in raws.items()}}
     planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
     saturated = {name: _saturated(raw, planes[name], options) for name, raw in raws.items()}
     square = slice(None), slice(*options.corner), slice(*options.corner)
@@ -99,57 +102,70 @@ def prepare(
     corners = {"psf": corner, "capture": corner}
     if options.psf_channels == "mean" and psf.channels != capture.channels:
         corners["capture"] = corner.mean(axis=0, keepdims=True)
-    found = {n: _background(b, raws[n], corners[n]) for n, b in backgrounds.items()}
-    levels = {n: level for n, (level, _) in found.items()}
+    levels = {n: _level(b, raws[n], corners[n]) for n, b in backgrounds.items()}
     noise = _noise((planes["psf"] - levels["psf"])[square].astype(np.float64), options)
-    log["background"] = {n: record for n, (_, record) in found.items()}
     planes = {n: planes[n] - levels[n] for n in planes}
-    log["clipping"] = {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()}
-    known = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
-    frames = {
-        n: _Frame(np.maximum(p, 0), saturated[n], _known(known, p.shape)) for n, p in planes.items()
-    }
-    log["validity"] = {
-        n: {"saturated": int(f.saturated.sum()), "dead": int((~f.known).sum()) // raws[n].channels}
-        for n, f in frames.items()
-    }
+    good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
+    frames = {n: _Frame(p, saturated[n], _known(good, p.shape)) for n, p in planes.items()}
+    logs = {n: _image_log(raws[n], backgrounds[n], levels[n], f) for n, f in frames.items()}
+    frames = {n: replace(f, values=np.maximum(f.values, 0)) for n, f in frames.items()}
     if options.bayer is not None:
         frames = {n: _demosaiced(f, options) for n, f in frames.items()}
-    how = options.demosaicing if options.bayer else None
-    log["demosaicing"] = {"pattern": options.bayer, "method": how}
     if options.crop is not None:
         frames["capture"] = _cropped(frames["capture"], options.crop)
-    shape = frames["capture"].values.shape[-2:]
+    shape = frames["capture"].shape
     if options.psf_scale is not None:
         frames["psf"] = _resampled(frames["psf"], shape, float(options.psf_scale))
-    log["resampling"] = {
-        "psf_scale": options.psf_scale,
-        "crop": options.crop,
-        "psf_shape": list(frames["psf"].values.shape[1:]),
-    }
-    frames = _downsampled(frames, options.downsample, log)
-    light = _prepared_psf(_filled(frames["psf"], "PSF"), noise, options, log)
+    psf_shape = frames["psf"].shape
+    frames, kept = _downsampled(frames, options.downsample)
+    light, cleaned = clean(
+        _filled(frames["psf"], "PSF"), noise, options.threshold, options.noise_threshold
+    )
+    centring = None
+    if options.centre is not None:
+        light, centring = centre_psf(light, options.centre)
+    if options.psf_channels == "mean":
+        light = light.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32)
     image = _filled(frames["capture"], "capture")
-    light, image = _scaled(light, image, options, log)
+    sums, divisor = _psf_divisor(light, options), _capture_divisor(image, options)
     valid = frames["capture"].known & ~frames["capture"].saturated
-    log["validity"] = {**log["validity"], "valid_share": float(valid.mean())}
-    log |= {"order": list(log), "options": dataclasses.asdict(options)}
-    return Prepared(light, image, valid, log)
+    log = PreparationLog(
+        options=options,
+        psf=logs["psf"],
+        capture=logs["capture"],
+        valid_share=float(valid.mean()),
+        psf_shape=psf_shape,
+        first_pixel=tuple(part.start for part in kept),
+        cropped_to=tuple(part.stop - part.start for part in kept),
+        shape=frames["capture"].shape,
+        noise=tuple(noise.tolist()),
+        clean_up=cleaned,
+        centring=centring,
+        psf_divisor=tuple(sums.tolist()),
+        capture_divisor=divisor,
+    )
+    light = (light / sums[:, None, None]).astype(np.float32)
+    return Prepared(light, (image.astype(np.float64) / divisor).astype(np.float32), valid, log)
 
 
-def _facts(raw: Raw) -> dict[str, Any]:
+def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Frame) -> ImageLog:
+    kind = background if isinstance(background, str) else "number"
     maximum = raw.pixels.max()
-    return {
-        "name": raw.name,
-        "format": raw.format,
-        "shape": list(raw.pixels.shape),
-        "bits": raw.bits,
-        "full_scale": raw.full_scale,
-        "minimum": float(raw.pixels.min()),
-        "maximum": float(maximum),
-        # Many pixels at the same maximum are saturated, whatever the converter's highest level.
-        "pixels_at_maximum": int(np.count_nonzero(raw.pixels == maximum)),
-    }
+    return ImageLog(
+        name=raw.name,
+        format=raw.format,
+        shape=raw.pixels.shape,
+        bits=raw.bits,
+        full_scale=raw.full_scale,
+        minimum=float(raw.pixels.min()),
+        maximum=float(maximum),
+        pixels_at_maximum=int(np.count_nonzero(raw.pixels == maximum)),
+        background=f"dark frame {background.name}" if isinstance(background, Raw) else kind,
+        level=tuple(level.mean(axis=(1, 2), dtype=np.float64).tolist()),
+        clipped=int(np.count_nonzero(frame.values < 0)),
+        saturated=int(frame.saturated.sum()),
+        dead=int((~frame.known).sum()) // raw.channels,
+    )
 
 
 def _in_full_scale(raw: Raw) -> np.ndarray:
@@ -175,17 +191,13 @@ def _noise(part: np.ndarray, options: Preparation) -> np.ndarray:
     return spread / options.downsample
 
 
-def _background(
-    background: Background, raw: Raw, corner: np.ndarray
-) -> tuple[np.ndarray, dict[str, Any]]:
-    """Level to subtract, in fractions of full scale, and its record."""
+def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
+    """Level to subtract, in fractions of full scale."""
     if isinstance(background, Raw):
-        level, kind = _in_full_scale(background), f"dark frame {background.name}"
-    elif isinstance(background, str):
-        level, kind = corner, background
-    else:
-        level, kind = np.full((1, 1, 1), background / raw.full_scale, np.float32), "number"
-    return level, {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
+        return _in_full_scale(background)
+    if isinstance(background, str):
+        return corner
+    return np.full((1, 1, 1), background / raw.full_scale, np.float32)
 
 
 def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
@@ -240,23 +252,18 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
     return _Frame(light, np.zeros(light.shape, bool), np.ones(light.shape, bool))
 
 
-def _downsampled(frames: dict[str, _Frame], factor: int, log: dict[str, Any]) -> dict[str, _Frame]:
-    """Block means, which one pixel of that size would have measured."""
-    shape = frames["capture"].values.shape[1:]
+def _downsampled(
+    frames: dict[str, _Frame], factor: int
+) -> tuple[dict[str, _Frame], tuple[slice, slice]]:
+    """Block means, which one pixel of that size would have measured, and what they cover."""
+    shape = frames["capture"].shape
     if factor > min(shape):
         raise MeasurementError(
             f"downsample = {factor} is larger than the image of {shape[0]}×{shape[1]} pixels"
         )
-    kept = central_blocks(shape, factor)
     if factor > 1:
         frames = {name: _means(frame, factor) for name, frame in frames.items()}
-    log["downsampling"] = {
-        "factor": factor,
-        "first_pixel": [part.start for part in kept],
-        "cropped_to": [part.stop - part.start for part in kept],
-        "shape": list(frames["capture"].values.shape[1:]),
-    }
-    return frames
+    return frames, central_blocks(shape, factor)
 
 
 def _means(frame: _Frame, factor: int) -> _Frame:
@@ -288,46 +295,25 @@ def _filled(frame: _Frame, name: str) -> np.ndarray:
     return np.stack(planes)
 
 
-def _prepared_psf(
-    psf: np.ndarray, noise: np.ndarray, options: Preparation, log: dict[str, Any]
-) -> np.ndarray:
-    """Clean, centre and average the PSF, as far as the options say."""
-    psf, cleaned = clean(psf, noise, options.threshold, options.noise_threshold)
-    log["clean_up"] = {**cleaned, "noise": noise.tolist()}
-    log["centring"] = {"by": None, "shift": [0, 0]}
-    if options.centre is not None:
-        psf, log["centring"] = centre_psf(psf, options.centre)
-    before = psf.shape[0]
-    if options.psf_channels == "mean":
-        psf = psf.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32)
-    log["channels"] = {"psf": options.psf_channels, "before": before, "after": psf.shape[0]}
-    return psf
-
-
-def _scaled(
-    psf: np.ndarray, capture: np.ndarray, options: Preparation, log: dict[str, Any]
-) -> tuple[np.ndarray, np.ndarray]:
+def _psf_divisor(psf: np.ndarray, options: Preparation) -> np.ndarray:
     sums = psf.sum(axis=(1, 2), dtype=np.float64)
     if not (sums > 0).all():
         raise MeasurementError(
             f"the PSF is black in channel {int(np.argmin(sums))} once the background is subtracted "
             "and small values removed; give a lower background, threshold or noise_threshold"
         )
-    if options.psf_sum == "joint":
-        sums = np.full_like(sums, sums.mean())
+    return np.full_like(sums, sums.mean()) if options.psf_sum == "joint" else sums
+
+
+def _capture_divisor(capture: np.ndarray, options: Preparation) -> float:
     precise = capture.astype(np.float64)
-    divisor = {
-        "maximum": float(precise.max()),
-        "norm": float(np.linalg.norm(precise)),
-        "none": 1.0,
-    }[options.capture_scale]
     if not precise.max() > 0:
         raise MeasurementError(
             "the capture is black once the background is subtracted; give a lower background"
         )
-    log["scaling"] = {"psf_divisor": sums.tolist(), "capture_divisor": divisor}
-    scaled = psf / sums[:, None, None], precise / divisor
-    return scaled[0].astype(np.float32), scaled[1].astype(np.float32)
+    if options.capture_scale == "none":
+        return 1.0
+    return float(precise.max() if options.capture_scale == "maximum" else np.linalg.norm(precise))
 
 
 def clean(
@@ -335,7 +321,7 @@ def clean(
     noise: Float[np.ndarray, "#channel"],
     threshold: float | int | None = None,
     noise_threshold: float | int | None = None,
-) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
+) -> tuple[Float[np.ndarray, "channel y x"], CleanUp]:
     """The PSF with its small values set to zero, and a record of what that removed.
 
     Small is below the larger of `threshold` times each channel's maximum and `noise_threshold`
@@ -350,18 +336,14 @@ def clean(
     small = psf < levels[:, None, None]
     kept = np.where(small, psf.dtype.type(0), psf)
     light = float(psf.sum(dtype=np.float64))
-    return kept, {
-        "threshold": threshold,
-        "noise_threshold": noise_threshold,
-        "level": levels.tolist(),
-        "zeroed": int(np.count_nonzero(small & (psf > 0))),
-        "light_removed": 1 - float(kept.sum(dtype=np.float64)) / light if light > 0 else 0.0,
-    }
+    removed = 1 - float(kept.sum(dtype=np.float64)) / light if light > 0 else 0.0
+    zeroed = int(np.count_nonzero(small & (psf > 0)))
+    return kept, CleanUp(tuple(levels.tolist()), zeroed, removed)
 
 
 def centre_psf(
     psf: Float[np.ndarray, "channel y x"], by: Centre
-) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
+) -> tuple[Float[np.ndarray, "channel y x"], Centring]:
     """The PSF shifted by whole pixels to the middle of its array, and a record of the shift.
 
     `by`: "centroid", "peak" or "symmetry" (see `Preparation`) of the channels' sum. Pixels shifted
@@ -373,12 +355,8 @@ def centre_psf(
     rows, columns = (math.floor((n - 1) / 2 - c + 0.5) for n, c in sides)
     moved = scipy.ndimage.shift(psf, (0, rows, columns), order=0)
     light = float(psf.sum(dtype=np.float64))
-    return moved, {
-        "by": by,
-        "found": [float(c) for c in found],
-        "shift": [rows, columns],
-        "light_lost": 1 - float(moved.sum(dtype=np.float64)) / light if light > 0 else 0.0,
-    }
+    lost = 1 - float(moved.sum(dtype=np.float64)) / light if light > 0 else 0.0
+    return moved, Centring(found, (rows, columns), lost)
 
 
 def _centre(image: np.ndarray, by: Centre) -> tuple[float, float]:

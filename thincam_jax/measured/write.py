@@ -1,5 +1,6 @@
 """Writing an image, linear or for display, and its log."""
 
+import dataclasses
 import io
 import json
 import math
@@ -17,9 +18,11 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.files import write_whole
 from thincam_jax.imaging.display import eight_bit, png_bytes
+from thincam_jax.measured.preparation_log import PreparationLog
 from thincam_jax.measured.raw import MeasurementError
 
 LINEAR = (".npy", ".tif", ".tiff")
+Log = Mapping[str, Any] | PreparationLog
 WhiteBalance = tuple[float | int, float | int, float | int] | Literal["grey_world"] | None
 
 
@@ -27,7 +30,7 @@ WhiteBalance = tuple[float | int, float | int, float | int] | Literal["grey_worl
 def write_image(
     path: str | os.PathLike[str],
     image: Numbers,
-    log: Mapping[str, Any] | None = None,
+    log: Log | None = None,
     *,
     white_balance: WhiteBalance = None,
     gamma: float | int = 2.2,
@@ -123,8 +126,8 @@ def _gains(image: np.ndarray, white_balance: WhiteBalance) -> np.ndarray:
 
 
 @checked
-def log_text(log: Mapping[str, Any]) -> str:
-    """JSON with sorted keys; non-finite numbers become null, arrays lists."""
+def log_text(log: Log) -> str:
+    """JSON with sorted keys, of a mapping or a record; numbers that are not finite are null."""
     plain = _plain(log)
     return json.dumps(plain, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -149,6 +152,8 @@ def linear_bytes(image: np.ndarray, suffix: str) -> bytes:
 
 def _plain(value: Any) -> Any:
     """Convert to values that JSON can hold."""
+    if dataclasses.is_dataclass(value):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -52,17 +52,15 @@ class PixelNoise:
 def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
     """Noise of a prepared capture: of a raw pixel's `counts`, or estimated from the capture."""
     log = prepared.log
-    full_scale = log["full_scale"]["capture"]["full_scale"]
     # One count of a raw pixel in units of the prepared capture.
-    scale = full_scale * log["downsampling"]["factor"] * log["scaling"]["capture_divisor"]
-    of_a_count = 1 / scale
+    of_a_count = 1 / (log.capture.full_scale * log.options.downsample * log.capture_divisor)
     if counts is not None:
         noise = counts * of_a_count
         return PixelNoise(noise, noise / of_a_count, "given")
     how = "estimated from the finest detail at each brightness"
     light, valid = (jnp.asarray(array) for array in (prepared.capture, prepared.valid))
     noise = 0.0
-    if log["demosaicing"]["method"] == "bilinear":
+    if log.options.bayer is not None and log.options.demosaicing == "bilinear":
         noise = float(demosaiced_noise(light, valid))
     if noise > 0:
         how = f"{how}, in every second pixel of each colour"

@@ -33,8 +33,8 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     assert "finished: loss" in done.stdout and str(out / NETWORK) in done.stdout
     result = json.loads((out / "training.json").read_text("utf-8"))
     assert result["steps"] == 4 and len(result["scores"]) == 2
-    card = network_card(out / NETWORK)["training"]
-    assert card["images"]["trained on"][0]["licence"] == "drawn" and card["cpu_seconds"] > 0
+    card = network_card(out / NETWORK)
+    assert card.images["trained on"][0].licence == "drawn" and card.cpu_seconds > 0
     assert "give --resume to go on with it" in line(call(file, "--out", out))
     assert call(file, "--out", out, "--resume").exit_code == 0
     state = out / STATE

@@ -81,4 +81,4 @@ def test_psf_of_a_mask_larger_than_the_sensor_is_whole(files):
     result = reconstruct(files, "--camera", files["study"], "--set", *wide)
     assert result.exit_code == 0, result.output
     assert np.load(out).shape == (48, 64)
-    assert record_of(out)["preparation"]["resampling"]["psf_shape"] == list(found.pixels.shape)
+    assert record_of(out)["preparation"]["psf_shape"] == list(found.pixels.shape)

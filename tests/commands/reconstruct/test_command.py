@@ -89,7 +89,7 @@ def test_twelve_bit_capture(grey, tmp_path):
     record = record_of(out)
     done = record["reconstruction"]
     assert record["sources"]["psf"] == str(grey["psf"]) and record["sources"]["bits"] == 12
-    assert record["preparation"]["background"]["capture"]["kind"] == f"dark frame {grey['dark']}"
+    assert record["preparation"]["capture"]["background"] == f"dark frame {grey['dark']}"
     assert record["files"] == {"png": "image.png", "npy": "image.npy"}
     assert (done["method"], done["tau"], done["iterations_at_most"]) == ("admm_tv", 2.0, 80)
     assert 0 < done["relative_data_residual"] < 0.01
@@ -117,7 +117,7 @@ def test_noise_that_is_given(grey, tmp_path):
     result = call(grey, out, *more, "--downsample", 2)
     assert "noise 3 counts (given)" in result.stdout
     record = record_of(out)
-    brightest = record["preparation"]["scaling"]["capture_divisor"]
+    brightest = record["preparation"]["capture_divisor"]
     done = record["reconstruction"]
     assert done["noise"] == {"counts": pytest.approx(3), "found": "given"}
     assert done["noise_standard_deviation"] == pytest.approx(1.5 / (4095 * brightest), rel=1e-5)
@@ -188,7 +188,7 @@ def test_mosaic(tmp_path):
     assert image.shape == (3, *simulated.SHAPE)
     for channel, expected in zip(image, simulated.scene(), strict=True):
         assert simulated.correlation(channel, expected) > 0.93
-    assert record_of(out)["preparation"]["demosaicing"]["pattern"] == "RGGB"
+    assert record_of(out)["preparation"]["options"]["bayer"] == "RGGB"
 
 
 @pytest.mark.thorough
@@ -448,8 +448,8 @@ def test_psf_has_its_own_bits_corner_and_pixels(grey, tmp_path):
     result = call(grey, out, *options, psf="fine")
     assert result.exit_code == 0, result.output
     told = record_of(out)
-    assert told["preparation"]["full_scale"]["psf"]["bits"] == 16
-    assert told["preparation"]["full_scale"]["capture"]["bits"] == 12
+    assert told["preparation"]["psf"]["bits"] == 16
+    assert told["preparation"]["capture"]["bits"] == 12
     assert told["preparation"]["options"]["corner"] == [2, 9]
     expected = simulated.scene()[1]
     assert simulated.correlation(np.load(out), expected) > 0.9

@@ -58,7 +58,7 @@ def test_folder_is_compiled_once(folder, tmp_path, compilations):
     for result in run_jobs(planned, sources(folder), SHORT, output):
         assert isinstance(result, Finished)
         counts.append(len(compilations))
-        shares.append(result.record["preparation"]["validity"]["valid_share"])
+        shares.append(result.record["preparation"]["valid_share"])
     # None at all where another test has compiled for these sizes before.
     assert len(counts) == 3 and counts[1] == counts[2] == counts[0]
     assert shares[0] == shares[2] == 1 and shares[1] < 1
@@ -95,7 +95,7 @@ def test_saturated_pixels_have_no_weight(folder, tmp_path):
     (result,) = run_jobs(planned, sources(folder), SHORT, output)
     assert isinstance(result, Finished)
     record = result.record
-    assert record["preparation"]["validity"]["capture"]["saturated"] == 40
+    assert record["preparation"]["capture"]["saturated"] == 40
     assert float(record["reconstruction"]["relative_data_residual"]) < 0.1
     assert simulated.correlation(np.load(output.path), simulated.scene()[1]) > 0.9
 

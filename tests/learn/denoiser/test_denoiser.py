@@ -106,15 +106,17 @@ def test_wrong_input_is_told(network, image, sigma, told):
 
 
 def test_a_file_comes_back(network, tmp_path):
-    file = save_network(tmp_path / "net.thincam", network, {"steps": 3})
+    file = save_network(tmp_path / "net.thincam", network, {"steps": 3, "scores": [0.5]})
     card = network_card(file)
-    assert card["training"] == {"steps": 3} and card["options"]["widths"] == [4, 6]
+    assert card.scores == (0.5,) and card.options.widths == (4, 6)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), network)
     assert eqx.tree_equal(Denoiser(file).network, single)
 
 
 def test_a_file_of_no_use_is_told(network, tmp_path):
-    file = tmp_path / "net.thincam"
+    file = save_network(tmp_path / "net.thincam", network, {"images": ["a.png"]})
+    with pytest.raises(CheckpointError, match="card of another version"):
+        network_card(file)
     spoilt = eqx.tree_at(lambda n: n.leave, network, network.leave.at[0, 0, 1, 1].set(jnp.nan))
     save_network(file, spoilt)
     with pytest.raises(CheckpointError, match="weights that are not finite; give an earlier file"):

@@ -21,7 +21,7 @@ from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_net
 from thincam_jax.learn.denoiser.pictures import Pictures, united
 from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
-from thincam_jax.learn.refocusing.unet import parameter_count
+from thincam_jax.learn.refocusing import sources, unet
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.plot.learned import draw_losses
 
@@ -68,8 +68,8 @@ def run_denoiser(config: DenoiserConfig, place: InFolder) -> Ended:
         **state.counts,
         "loss": float(np.nanmin(state.scores)),
         "scores": [None if score != score else round(float(score), 5) for score in state.scores],
-        "learned_numbers": parameter_count(network),
-        "images": lessons.manifest()["images"],
+        "learned_numbers": unet.parameter_count(network),
+        "images": sources.as_json(lessons.images),
         "network": NETWORK,
     }
     folder.save_figure("loss", draw_losses(state, config.training.check_every))

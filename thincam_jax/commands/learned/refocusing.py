@@ -110,7 +110,7 @@ def run_training(config: LearnedConfig, place: InFolder) -> Ended:
         "learned_numbers": parameter_count(result.network.weights),
         "linear": asdict(result.linear),
         "trained": asdict(result.scores),
-        "images": lessons.manifest()["images"],
+        "images": sources.as_json(lessons.images),
         "network": NETWORK,
     }
     folder.save_figure("loss", plot.draw_losses(state, config.training.check_every))

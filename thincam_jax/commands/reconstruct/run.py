@@ -151,7 +151,7 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
     record = {
         "capture": job.capture,
         "sources": _source_facts(rig.sources),
-        "preparation": ready.log,
+        "preparation": asdict(ready.log),
         "reconstruction": made.record | {"noise": {"counts": noise.counts, "found": noise.found}},
         "image": {
             "shape": image.shape,

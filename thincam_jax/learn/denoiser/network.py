@@ -25,6 +25,7 @@ from thincam_jax.learn.checkpoint import (
     write_arrays,
 )
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
+from thincam_jax.learn.refocusing.sources import Entry
 
 _KIND = "denoiser"
 SHIPPED = "shipped"
@@ -154,9 +155,9 @@ def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
     that are not finite; OSError for what cannot be read.
     """
     path = _SHIPPED_FILE if str(path) == SHIPPED else path
-    stored = network_card(path)["options"]
+    description = network_description(path)
     try:
-        options = DenoiserOptions(tuple(stored["widths"]), tuple(stored["blocks"]))
+        options = _options(description)
         like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
     except Exception as error:  # whatever another's options bring about
         raise CheckpointError(f"{path}: options of another version ({of_error(error)})") from None
@@ -164,9 +165,41 @@ def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
     return read_weights(path, like)
 
 
-def network_card(path: str | os.PathLike[str] = SHIPPED) -> dict[str, Any]:
-    """Card of a network's file: `options` and `training`, with the images' licences."""
+@dataclasses.dataclass(frozen=True)
+class NetworkCard:
+    """What a denoiser was trained with.
+
+    - `images`: names, sums and licences of the pictures by their use.
+    - `scores`: loss of each check, on pictures held out; `cpu_seconds`: of the last training.
+    """
+
+    options: DenoiserOptions
+    images: dict[str, tuple[Entry, ...]]
+    scores: tuple[float, ...]
+    cpu_seconds: float
+
+
+def network_card(path: str | os.PathLike[str] = SHIPPED) -> NetworkCard:
+    """Card of a network's file. **Errors**: as of `load_network`."""
     path = _SHIPPED_FILE if str(path) == SHIPPED else path
+    description = network_description(path)
+    told = description["training"]
+    try:
+        uses = told.get("images", {}).items()
+        images = {use: tuple(Entry(**one) for one in entries) for use, entries in uses}
+        numbers = tuple(told.get("scores", ())), float(told.get("cpu_seconds", 0.0))
+        return NetworkCard(_options(description), images, *numbers)
+    except Exception as error:  # whatever another's card holds
+        raise CheckpointError(f"{path}: card of another version ({of_error(error)})") from None
+
+
+def _options(description: dict[str, Any]) -> DenoiserOptions:
+    stored = description["options"]
+    return DenoiserOptions(tuple(stored["widths"]), tuple(stored["blocks"]))
+
+
+def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """`options` and `training` of a network's file, as JSON."""
     description = read_description(path)
     parts = (description.get(name) for name in ("options", "training"))
     if description.get("kind") != _KIND or not all(isinstance(part, dict) for part in parts):

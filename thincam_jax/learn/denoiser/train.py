@@ -19,6 +19,7 @@ from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import LEAST, MOST, denoised, network_card, save_network
 from thincam_jax.learn.denoiser.pictures import TILE, Pictures
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
+from thincam_jax.learn.refocusing.sources import Entry, as_json
 from thincam_jax.learn.training import (
     Task,
     Trained,
@@ -84,15 +85,11 @@ class DenoisingLessons:
         judged = [draw_crops(tiles, self.batch, self.crop, one) for one in keys]
         return Task(draw, loss, judged)
 
-    def manifest(self) -> dict[str, Any]:
-        """The pictures as JSON, with their sums and licences, and the crops."""
+    @property
+    def images(self) -> dict[str, tuple[Entry, ...]]:
+        """Entries of all pictures by their use."""
         uses = {"trained on": self.pictures, "judged on": self.held_out}
-        images = {
-            use: [dataclasses.asdict(entry) for entry in pictures.manifest]
-            for use, pictures in uses.items()
-            if pictures is not None
-        }
-        return {"images": images, "batch": self.batch, "crop": self.crop, "judged": self.judged}
+        return {use: one.manifest for use, one in uses.items() if one is not None}
 
 
 @eqx.filter_jit
@@ -169,7 +166,7 @@ def train_denoiser(
     state = begun = TrainingState.begin(network, task, options)
     if folder is not None:
         widths, blocks = network.shape
-        told = {**lessons.manifest(), "training": dataclasses.asdict(options)}
+        told = _described(lessons, options)
         settings = {"widths": widths, "blocks": blocks, **told}
         path = Path(folder) / STATE
         before = 0.0
@@ -180,11 +177,18 @@ def train_denoiser(
     return train_model(task, network, options, state=state, keep=keep, callback=callback)
 
 
+def _described(lessons: DenoisingLessons, options: TrainingOptions) -> dict[str, Any]:
+    """The pictures with their sums and licences, the crops and the options as JSON."""
+    crops = {name: getattr(lessons, name) for name in ("batch", "crop", "judged")}
+    described = {"training": dataclasses.asdict(options), **crops}
+    return {"images": as_json(lessons.images), **described}
+
+
 def _seconds(path: Path) -> float:
     """CPU time that a network was trained for."""
     try:
-        return float(network_card(path)["training"]["cpu_seconds"])
-    except (OSError, CheckpointError, KeyError, TypeError, ValueError):
+        return network_card(path).cpu_seconds
+    except (OSError, CheckpointError):
         return 0.0
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,11 @@ class Entry:
     name: str
     sha256: str
     licence: str
+
+
+def as_json(images: dict[str, tuple[Entry, ...]]) -> dict[str, list[dict[str, str]]]:
+    """Entries of images by their use, for a JSON file."""
+    return {use: [asdict(entry) for entry in entries] for use, entries in images.items()}
 
 
 @dataclass(frozen=True, eq=False)

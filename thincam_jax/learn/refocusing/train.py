@@ -18,7 +18,7 @@ from thincam_jax._core.table import Table
 from thincam_jax.learn.refocusing.loss import Examples, examples, loss
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch, SceneOptions, draw_batch
-from thincam_jax.learn.refocusing.sources import Entry, Source
+from thincam_jax.learn.refocusing.sources import Entry, Source, as_json
 from thincam_jax.learn.refocusing.store import described, save
 from thincam_jax.learn.training import (
     Task,
@@ -92,19 +92,6 @@ class Lessons:
         ]
         return Table(("image", "use", "licence", "SHA-256"), rows)
 
-    def manifest(self) -> dict[str, Any]:
-        """The images as JSON, with their sums and licences; and how scenes are drawn."""
-        return {
-            "images": {
-                use: [dataclasses.asdict(entry) for entry in entries]
-                for use, entries in self.images.items()
-            },
-            "scenes": dataclasses.asdict(self.scenes),
-            "batch": self.batch,
-            "pool": self.pool,
-            "judged": self.judged,
-        }
-
 
 @eqx.filter_jit
 def _taken(pool: Examples, size: int, key) -> Examples:
@@ -137,7 +124,7 @@ def train(
     """
     count = network.options.steps
     each = dataclasses.replace(options, steps=-(-options.steps // count))
-    told = {**lessons.manifest(), "training": dataclasses.asdict(options)}
+    told = _described(lessons, options)
     settings = {
         "camera": described(network.camera),
         "options": dataclasses.asdict(network.options),
@@ -166,6 +153,14 @@ def train(
     known = {"losses": np.concatenate(losses), "scores": np.concatenate(scores)}
     state = dataclasses.replace(trained.state, step=len(known["losses"]), **known)
     return Trained(network.first(len(losses)), state, trained.status)
+
+
+def _described(lessons: Lessons, options: TrainingOptions) -> dict[str, Any]:
+    """The images with their sums and licences, how scenes are drawn and the options as JSON."""
+    drawn = {name: getattr(lessons, name) for name in ("batch", "pool", "judged")}
+    described = {"scenes": lessons.scenes, "training": options}
+    described = {name: dataclasses.asdict(one) for name, one in described.items()}
+    return {"images": as_json(lessons.images), **drawn, **described}
 
 
 def _keep(path: Path, network: RefocusNetwork, settings, told, state: TrainingState) -> None:
