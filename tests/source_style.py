@@ -1,6 +1,7 @@
 """Rules of the style of the package's source, which tests/test_architecture.py applies."""
 
 import ast
+import re
 from collections.abc import Iterator
 
 from source_tree import DOC, MAX_LINES, MOST_PARAMETERS, Module
@@ -181,6 +182,18 @@ def bare_parameters(
             yield node, bare
 
 
+_VAGUE = {r"told\b(?!\s+apart)": "reported, given or found"}
+
+
+def vague_words(modules: list[Module]) -> list[str]:
+    return [
+        f"{module.path}: {found[0]}: say what it is: {better}"
+        for module in modules
+        for word, better in _VAGUE.items()
+        for found in re.finditer(rf"\b(?i:{word})\b", module.text)
+    ]
+
+
 STYLE_RULES = (
     bare_files,
     tables_of_units,
@@ -191,10 +204,12 @@ STYLE_RULES = (
     missing_docstrings,
     missing_annotations,
     rounded_products,
+    vague_words,
 )
 
 # rule, file, source, part of the complaint
 BROKEN_STYLE = [
+    (vague_words, "design/a.py", "told = 'alike: cannot be told apart'", "reported, given"),
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
     (

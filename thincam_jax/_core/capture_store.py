@@ -67,11 +67,11 @@ def zarr_library() -> Any:
 
 @contextlib.contextmanager
 def opened(
-    path: str | Path, kinds: Sequence[str], told: tuple[str, str], mode: str = "r"
+    path: str | Path, kinds: Sequence[str], wanted: tuple[str, str], mode: str = "r"
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
     """The Zarr group at `path` and its attributes, for a block that takes its arrays.
 
-    - `told`: what it is to be, and what makes one.
+    - `wanted`: what it is to be, and what makes one.
 
     **Errors**: CaptureStoreError, one line, where it is of none of the `kinds` or of another
     version, or where the block finds something missing or wrong.
@@ -90,7 +90,7 @@ def opened(
         yield group, attributes
     except Exception as error:  # whatever Zarr makes of another's metadata
         raise CaptureStoreError(
-            f"{path} is no {told[0]} ({of_error(error)}); give one that {told[1]} made"
+            f"{path} is no {wanted[0]} ({of_error(error)}); give one that {wanted[1]} made"
         ) from error
 
 
@@ -113,8 +113,8 @@ class CaptureStore:
 
     def __init__(self, path: Path, mode: str = "r", kinds: Sequence[str] = (CALIBRATION, CAPTURES)):
         self.path, self._chunks = path, path / "frames" / "c"
-        told = f"store of {kinds[-1]}", "an acquisition or create_captures"
-        with opened(path, kinds, told, mode) as (self.group, self.attributes):
+        wanted = f"store of {kinds[-1]}", "an acquisition or create_captures"
+        with opened(path, kinds, wanted, mode) as (self.group, self.attributes):
             # A chunk of black frames is written, too: one that is not there is missing.
             dtype, shape = dtype_of_bits(self.attributes["bits"]), self.attributes["sensor_shape"]
             frames = stored_array(self.group, "frames", 3, (dtype,))

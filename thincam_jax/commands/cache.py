@@ -1,6 +1,6 @@
 """The compiled programs that commands keep from one run to the next, in the user's cache folder.
 
-JAX keeps them. It is told so through the environment, before it is imported: `thincam --help` need
+JAX keeps them. It learns so from the environment, before it is imported: `thincam --help` need
 not wait for JAX, and worker processes keep their programs in the same folder.
 """
 
@@ -17,7 +17,7 @@ _SETTINGS = {
     # A command has many small programs, of which most take longer to compile than to read.
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     # XLA takes the processor for another one and says so in 4 kB for each program that it reads
-    # (https://github.com/jax-ml/jax/issues/38445). Failures are exceptions, which are told anyway.
+    # (https://github.com/jax-ml/jax/issues/38445). What fails is an exception anyway.
     "TF_CPP_MIN_LOG_LEVEL": "3",
 }
 
@@ -34,7 +34,7 @@ def cache_folder() -> Path:
 
 
 def keep_programs() -> None:
-    """Have JAX keep what it compiles, unless the user has told JAX where to.
+    """Have JAX keep what it compiles, unless the user has said where.
 
     Where the folder cannot be written, nothing is kept and nothing is said; where another process
     holds it, a line says so.

@@ -69,7 +69,7 @@ def _own(errors: list[Any]) -> list[Any]:
 
 
 def _once(faults: list[tuple[str, str, str]], places: Places) -> list[str]:
-    """A line for each fault; what one option does to several entries is told of the first."""
+    """A line for each fault; what one option does to several entries is reported of the first."""
     lines: dict[tuple[str, ...], list[str]] = {}
     for place, field, message in faults:
         one = (place, message) if place in places.asked.values() else (place, message, field)

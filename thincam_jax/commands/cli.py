@@ -21,7 +21,7 @@ from thincam_jax.commands.kinds import init, load_experiment
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
-from thincam_jax.commands.terminal import WRONG_INPUT, say, say_result, tell, told
+from thincam_jax.commands.terminal import WRONG_INPUT, reported, say, say_result, tell
 
 ORDER = (
     *("init", "explain", "explore", "run", "preview", "capture", "reconstruct", "calibrate"),
@@ -86,11 +86,11 @@ class BenchGroup(TyperGroup):
 
 
 class Grouped(TyperCommand):
-    """Options in groups, and nothing else: a file is told which command takes it."""
+    """Options in groups, and nothing else: for a file, the command that takes it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0].endswith((".yaml", ".yml")):
-            with told(lambda: "interrupted"):
+            with reported(lambda: "interrupted"):
                 load_experiment(args[0], (), self.name)
         return super().parse_args(ctx, args)
 
@@ -185,7 +185,7 @@ def doctor(
     ask: Annotated[str | None, typer.Option(help="A serial port to ask what it is.")] = None,
 ) -> None:
     """Print versions, devices and what is missing."""
-    with told(lambda: "interrupted"):
+    with reported(lambda: "interrupted"):
         from thincam_jax._core.environment import machine_report, package_report
 
         programs = f"compiled programs: {cache_state()}"

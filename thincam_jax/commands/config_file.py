@@ -78,7 +78,7 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
     if not isinstance(raw, dict):
         raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
     if twice:
-        raise ConfigError("\n".join(f"{path}:{line}: {told}" for line, told in sorted(twice)))
+        raise ConfigError("\n".join(f"{path}:{line}: {fault}" for line, fault in sorted(twice)))
     return raw, places
 
 

@@ -10,7 +10,7 @@ import typer
 
 from thincam_jax._core.text import spelled
 from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment
-from thincam_jax.commands.terminal import ConfigFile, Overrides, say, say_result, told
+from thincam_jax.commands.terminal import ConfigFile, Overrides, reported, say, say_result
 
 
 def schema(
@@ -19,7 +19,7 @@ def schema(
     ],
 ) -> None:
     """Print the JSON Schema of a kind of experiment file, with which editors complete and check."""
-    with told(lambda: "interrupted"):
+    with reported(lambda: "interrupted"):
         import json
 
         from thincam_jax.commands.config_file import ConfigError
@@ -36,7 +36,7 @@ def explain(config: ConfigFile, set_: Overrides = None) -> None:
     Also what a run computes: error, memory and operations of PSFs, rays of a screen, evaluations of
     a search, frames of a capture, steps of a training.
     """
-    with told(lambda: "interrupted"):
+    with reported(lambda: "interrupted"):
         asked = load_experiment(config, tuple(set_ or ()), command=None)
         rows = list(values(asked))
         width = max(len(f"{key}: {value}") for key, value, _ in rows if len(value) <= _LONGEST)
@@ -112,9 +112,9 @@ def _psfs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[st
     for camera, exposure, words in [*alike.values()][::-1]:
         seen = {"wavelength": exposure.wavelength, "object_distance": object_distance}
         cost, error = predict_cost(camera, **seen, **how)
-        told = "" if error is None else f", predicted error {error:.1g}"
+        predicted = "" if error is None else f", predicted error {error:.1g}"
         yield (
-            f"PSF at {exposure.distance:g} mm of {words}: {asked.model}{told}, "
+            f"PSF at {exposure.distance:g} mm of {words}: {asked.model}{predicted}, "
             f"{readable(cost.bytes)}, {cost.flops / 1e9:.2g} billion operations"
         )
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import ConfigFile, Overrides, say_result, told
+from thincam_jax.commands.terminal import ConfigFile, Overrides, reported, say_result
 
 Port = Annotated[int, typer.Option(help="Of the page; 0 takes a free one.")]
 Browser = Annotated[bool, typer.Option(help="Open the page.")]
@@ -35,7 +35,7 @@ def explore(
 
     Only this machine reaches it, and only with the address that is printed. Ctrl-C ends it.
     """
-    with told(lambda: "interrupted"):
+    with reported(lambda: "interrupted"):
         from thincam_jax.commands.kinds import load_study
 
         asked = load_study(config, tuple(set_ or ()), "explore takes a study")

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import say, say_result, show, told
+from thincam_jax.commands.terminal import reported, say, say_result, show
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def init(
     out: Annotated[Path | None, typer.Option(help="File, or folder; default EXAMPLE.yaml.")] = None,
 ) -> None:
     """Write an example experiment file to begin with; or list these."""
-    with told(lambda: "interrupted"):
+    with reported(lambda: "interrupted"):
         import yaml
 
         from thincam_jax._core.files import write_whole

@@ -14,10 +14,10 @@ from thincam_jax.commands.terminal import (
     Overrides,
     counted,
     progress_bar,
+    reported,
     say,
     say_result,
     show,
-    told,
     warn,
 )
 
@@ -49,7 +49,7 @@ def run(
         done = done or "no target yet"
         return f"interrupted; finished: {done}. The same command goes on from there."
 
-    with told(interrupted):
+    with reported(interrupted):
         from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.kinds import kind_of, load_experiment
@@ -92,7 +92,7 @@ def design(
     Ctrl-C keeps the targets that are finished; the same command goes on from there.
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
-    with told(lambda: goes_on):
+    with reported(lambda: goes_on):
         from thincam_jax.commands import explain
         from thincam_jax.commands.design.build import build_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
@@ -131,7 +131,7 @@ def train(
     since the last check; --resume goes on from there, to the same numbers.
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
-    with told(lambda: goes_on):
+    with reported(lambda: goes_on):
         from thincam_jax.commands import explain
         from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.commands.learned.training import InFolder, TrainingFolder
@@ -177,7 +177,7 @@ def accuracy(
 
     And what an error of the PSF costs in PSNR. Writes accuracy.json.
     """
-    with told(lambda: "interrupted; nothing is kept."):
+    with reported(lambda: "interrupted; nothing is kept."):
         from thincam_jax.commands.accuracy import BenchFolder, check, run_accuracy
         from thincam_jax.commands.kinds import load_study
 

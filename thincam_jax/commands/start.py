@@ -15,7 +15,7 @@ def main() -> None:
     end_on_interrupt()
     os.environ["MPLBACKEND"] = "agg"  # figures are files
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Each line at once, so that a full disk is told; escaped what the encoding lacks.
+        # Each line at once, so that a full disk is reported; escaped what the encoding lacks.
         sys.stdout.reconfigure(errors="backslashreplace", line_buffering=True)
     from thincam_jax.commands.cli import app
 
@@ -26,7 +26,7 @@ def main() -> None:
             os.write(2, f"thincam: {end}\n".encode())
         if code := getattr(end, "code", 2):
             # Not by way of the interpreter's end: threads that still compile may crash there, and
-            # what could not be printed would be told again.
+            # what could not be printed would be reported again.
             os._exit(code)
         raise
 

@@ -37,7 +37,7 @@ DryRun = Annotated[
 
 
 @contextlib.contextmanager
-def told(interrupted: Callable[[], str]) -> Iterator[None]:
+def reported(interrupted: Callable[[], str]) -> Iterator[None]:
     """Report user errors in one line, and Ctrl-C by the text that `interrupted` gives.
 
     Anything else is a defect and keeps its traceback. Python's warnings take a line each, too.

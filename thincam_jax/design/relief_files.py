@@ -91,8 +91,8 @@ def read_height_map(path: str | os.PathLike[str]) -> PhaseMask:
             interpolation=record["interpolation"],
         )
     except (ValueError, TypeError, KeyError) as error:
-        told = str(error).splitlines()[0]
-        raise MeasurementError(f"{path.with_suffix('.json')}: is no mask's ({told})") from None
+        reason = str(error).splitlines()[0]
+        raise MeasurementError(f"{path.with_suffix('.json')}: is no mask's ({reason})") from None
 
 
 def write_stl(path: str | os.PathLike[str], mask: PhaseMask, *, base: Number = 0.1) -> Path:

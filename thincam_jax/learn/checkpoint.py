@@ -3,7 +3,7 @@
 The line holds the format, who wrote the file, a description, name, byte count and SHA-256 of each
 array, and the line's own SHA-256. A file is written whole or not at all. Read it is only after
 all counts and sums have been found right, so that what is announced costs no memory and a flipped
-bit is told; then dtype and shape of each array must be those of the pytree that it is to fill.
+bit is reported; then dtype and shape of each array must be those of the pytree that it is to fill.
 safetensors would be read elsewhere, too, but has no sums: a flipped bit of a weight would pass.
 """
 

@@ -309,7 +309,7 @@ def remaining_deviation(
 def noise_mistake(
     normal: AbstractNormal, found: Image, shift: Float[Array, ""], precision: Float[Array, ""]
 ) -> Float[Array, ""]:
-    r"""Deviation of the noise in the residual of z over the one told.
+    r"""Deviation of the noise in the residual of z over the one given.
 
     Noise alone makes :math:`E \sum w (A z - g)^2 = N - n + s^{-4}\,\mathrm{tr}\,M^{-2}` of N
     pixels and n unknowns. 1 where that is too few pixels to tell.

@@ -8,7 +8,7 @@ So it gives several guesses; two Gauss–Newton steps refine each within the cub
     [L(p) - L^{target}], \qquad J = \partial L/\partial p
 
 with the best of several dampings μ; and the best of what comes out is the answer. The response
-model judges every guess, so the misfit that is told is the design's, not the network's opinion.
+model judges every guess, so the misfit that is reported is the design's, not the network's opinion.
 """
 
 import json

@@ -205,8 +205,8 @@ def train_model(
         seconds = [*seconds[-_RECENT:], time.perf_counter() - began]
         if callback is not None:
             left = float(np.median(seconds)) * (options.steps - state.step)
-            told = {name: float(part) for name, part in parts.items()}
-            progress = (state.step, options.steps, float(loss), told, _lowest(state), left)
+            numbers = {name: float(part) for name, part in parts.items()}
+            progress = (state.step, options.steps, float(loss), numbers, _lowest(state), left)
             if callback(TrainingProgress(*progress)):
                 status = "stopped"
                 break

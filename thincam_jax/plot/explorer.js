@@ -142,12 +142,12 @@ export function mount(root, controls, request, captions = null, live = false) {
     values[name] = value;
     const row = element("label", knobs);
     element("span", row, { textContent: label });
-    const told = element("output", row, { textContent: `${digits(value)} ${unit}` });
+    const shown = element("output", row, { textContent: `${digits(value)} ${unit}` });
     const slider = element("input", row, { type: "range", min: low, max: high, step: "any", value });
     slider.name = name;
     slider.addEventListener("input", () => {
       values[name] = slider.valueAsNumber;
-      told.textContent = `${digits(values[name])} ${unit}`;
+      shown.textContent = `${digits(values[name])} ${unit}`;
       turn(values);
     });
   }

@@ -26,7 +26,7 @@ class Figure(matplotlib.figure.Figure):
         raise NotImplementedError  # IPython goes on to the picture
 
     def _repr_png_(self) -> bytes:
-        return as_png(self)  # as long as IPython has not been told how pyplot's are drawn
+        return as_png(self)  # until IPython knows how pyplot's are drawn
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -101,7 +101,7 @@ class PsfCheck:
         low, high = min(1.0, self.interval[0]), max(1.0, self.interval[1])
         fits = "your PSF fits best as it is"
         if high - low > _TOLD:
-            fits = f"your PSF fits; from {low:.3f} to {high:.3f} times its size, it cannot be told"
+            fits = f"your PSF fits; {low:.3f} to {high:.3f} times its size cannot be told apart"
         return "\n".join([first, *(faults or [fits])])
 
 

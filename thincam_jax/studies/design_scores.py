@@ -249,7 +249,7 @@ class FrontScores:
         points.append((f"{reference}: {_cost(self.reference.cost)}", self.reference))
         pictures = tuple(self.points[0].simulated_psnr_db or ())
 
-        def told(point: PointScores) -> tuple[str, ...]:
+        def cells(point: PointScores) -> tuple[str, ...]:
             if name == "captures":
                 simulated = point.simulated_psnr_db or {}
                 levels = (number(simulated.get(picture), 2) for picture in pictures)
@@ -261,7 +261,7 @@ class FrontScores:
             )
 
         kept = {True: "no", False: "yes", None: ""}
-        rows = [(text, *p.cells(names), *told(p), kept[p.dominated]) for text, p in points]
+        rows = [(text, *p.cells(names), *cells(p), kept[p.dominated]) for text, p in points]
         if name != "captures":
             headings = ("cycles/rad", "line pairs/mm on the object", "", "front")
             title = f"{name.capitalize()} against resolution"

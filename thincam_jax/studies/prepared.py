@@ -72,7 +72,7 @@ def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
 def computed_psf(cameras: Cameras, name: str) -> Raw:
     """PSF of a camera as a measured one, also beyond the sensor where the shadow is larger.
 
-    `name`: what the numbers of the camera and its light are told after.
+    `name`: what stands before the numbers of the camera and its light.
     """
     (camera,), wavelength, distance = cameras.cameras, cameras.wavelength, cameras.object_distance
     how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}

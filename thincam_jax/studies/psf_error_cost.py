@@ -374,10 +374,10 @@ class AccuracyResult:
                 shown.append([name, "not run", *[None] * 4])
                 continue
             error, predicted, seconds, compiling = (float(number or 0) for number in numbers_of)
-            told = "reference" if error == 0 else f"{error:.1e}"
+            error_text = "reference" if error == 0 else f"{error:.1e}"
             worth = "yes" if row.worth_choosing else ""
             times = f"{1000 * seconds:.2f}", f"{compiling:.1f}"
-            shown.append([name, told, f"{predicted:.1e}", *times, worth])
+            shown.append([name, error_text, f"{predicted:.1e}", *times, worth])
         headings = ("PSF", "error", "predicted", "time ms", "compile s", "worth it")
         return Table(headings, shown, title=f"{largest[0]}×{largest[1]} pixels")
 

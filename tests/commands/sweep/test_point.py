@@ -11,7 +11,7 @@ from commands.sweep import mini
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.sweep import point as point_module
-from thincam_jax.commands.sweep.point import told
+from thincam_jax.commands.sweep.point import described
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_refused_point_has_its_reason(config):
         "--grid methods.0.shots.0.beta=25,-5 rad/mm^2: methods[0].shots[0].beta: "
         '"-5 rad/mm^2" is not positive; give a value above zero'
     )
-    assert told(bad.values) == "methods.0.shots.0.beta=-5 rad/mm^2"
+    assert described(bad.values) == "methods.0.shots.0.beta=-5 rad/mm^2"
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     progress_bar,
+    reported,
     say_result,
     tell,
-    told,
     warn,
 )
 
@@ -54,7 +54,7 @@ def capture(
         typed = "".join(f" --set '{text}'" for text in set_ or ())
         return f"{kept}; go on with: thincam capture {config} --out {store} --resume{typed}"
 
-    with told(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
+    with reported(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import write_whole
         from thincam_jax.commands import explain
         from thincam_jax.commands.checked_config import dump_config
@@ -110,7 +110,7 @@ def preview(
 
     Turn exposure, gain, the pattern and the stage; k keeps a frame in frames/. Ctrl-C ends it.
     """
-    with told(lambda: "interrupted"):
+    with reported(lambda: "interrupted"):
         from thincam_jax.commands.capture.run import build_study
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.hardware.errors import HardwareError

@@ -132,7 +132,7 @@ class FreeConfig(Section):
     @pydantic.field_validator("bounds", mode="before")
     @classmethod
     def _read(cls, given: Any, info: Any) -> Any:
-        if "variable" not in info.data:  # told by itself; of which kind these are is not known
+        if "variable" not in info.data:  # reported by itself; of which kind these are is not known
             return (1.0, 1.0)
         if not isinstance(given, list | tuple) or len(given) != 2:
             raise ValueError(f"{given!r} is no pair; give [lowest, highest]")

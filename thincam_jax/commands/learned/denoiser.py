@@ -89,8 +89,8 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
     try:
         network = load_network(config.start)
     except FileNotFoundError:
-        told = f"{config.start}: is missing; give a network's file, or 'shipped'"
-        raise ConfigError(f"{config.place_of('start')}start: {told}") from None
+        fault = f"{config.start}: is missing; give a network's file, or 'shipped'"
+        raise ConfigError(f"{config.place_of('start')}start: {fault}") from None
     except (CheckpointError, OSError) as error:
         raise ConfigError(f"{config.place_of('start')}start: {error}") from None
     if network.shape != (options.widths, options.blocks):

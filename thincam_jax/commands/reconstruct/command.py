@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 from typer import Option
 
-from thincam_jax.commands.terminal import Overrides, say_result, told
+from thincam_jax.commands.terminal import Overrides, reported, say_result
 
 # What works from a measured PSF and prepared captures; "auto" then is admm-tv.
 METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
@@ -123,7 +123,7 @@ def reconstruct(
     was done. Ctrl-C keeps the best image so far.
     """
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
-    with told(lambda: nothing):
+    with reported(lambda: nothing):
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
         from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
@@ -194,7 +194,7 @@ def check(
     Tries other scales, turns and mirror images of it. The exit code is 1 if one of them fits
     better.
     """
-    with told(lambda: "interrupted; nothing is known of the PSF"):
+    with reported(lambda: "interrupted; nothing is known of the PSF"):
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.options import Sources
         from thincam_jax.commands.reconstruct.run import check_files, enough_blocks

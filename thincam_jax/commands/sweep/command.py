@@ -11,9 +11,9 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     progress_bar,
+    reported,
     say_result,
     tell,
-    told,
     warn,
 )
 
@@ -57,7 +57,7 @@ def sweep(
         kept = f"{rows} points are kept" if rows else "no point is kept yet"
         return f"interrupted; {kept}. The same command goes on from there."
 
-    with told(interrupted):
+    with reported(interrupted):
         _check(scheduler, workers)
         from thincam_jax._core.precision import is_double
         from thincam_jax.commands import explain
@@ -105,14 +105,14 @@ def _check(scheduler: str | None, workers: int | None) -> None:
 
 
 def _print(swept: Any, path: Path) -> None:
-    from thincam_jax.commands.sweep.point import told as told_values
+    from thincam_jax.commands.sweep.point import described
 
     table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
     if swept.rows:
         say_result("results", path / "results.parquet", "\n".join([table, *swept.best]))
     if swept.failures:
         first = swept.failures[0]
-        values = told_values(first["values"])
+        values = described(first["values"])
         tell(
             f"{len(swept.failures)} of {swept.points} points failed; the first ({values}): "
             f"{first['reason']}; all are in {path / 'failures.jsonl'}. "

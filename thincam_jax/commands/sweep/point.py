@@ -63,14 +63,14 @@ def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[G
     for point in points:
         if point.key in first:
             raise ConfigError(
-                f"--grid: {told(point.values)} comes twice: two of its values are the same; "
+                f"--grid: {described(point.values)} comes twice: two of its values are the same; "
                 "give each once"
             )
         first[point.key] = point
     return points
 
 
-def told(values: dict[str, Any]) -> str:
+def described(values: dict[str, Any]) -> str:
     """Swept values in a message."""
     return ", ".join(f"{path}={value}" for path, value in values.items())
 
@@ -79,7 +79,7 @@ def doubts(points: Sequence[GridPoint]) -> list[str]:
     """Warnings of the first point that has any, and the number of such points."""
     doubtful = [point for point in points if point.warnings]
     return [
-        f"{len(doubtful)} of {len(points)} points; the first ({told(first.values)}): "
+        f"{len(doubtful)} of {len(points)} points; the first ({described(first.values)}): "
         f"{'; '.join(first.warnings)}"
         for first in doubtful[:1]
     ]

@@ -13,7 +13,7 @@ from pyarrow import csv
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.schema import Section
-from thincam_jax.commands.sweep.point import GridPoint, Outcome, measure_point, one_line, told
+from thincam_jax.commands.sweep.point import GridPoint, Outcome, described, measure_point, one_line
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 
 _PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
@@ -48,10 +48,10 @@ class SweepFolder(RunFolder):
     def keep(self, point: GridPoint, outcome: Outcome) -> None:
         """Write what became of a point."""
         if outcome.metrics is None:
-            told = {"point": point.key, "values": point.values, "reason": outcome.reason}
+            record = {"point": point.key, "values": point.values, "reason": outcome.reason}
             if outcome.traceback:
-                told["traceback"] = outcome.traceback
-            write_whole(self._failure(point), json.dumps(told, ensure_ascii=False) + "\n")
+                record["traceback"] = outcome.traceback
+            write_whole(self._failure(point), json.dumps(record, ensure_ascii=False) + "\n")
         else:
             row = {**point.values, "point": point.key, **outcome.metrics}
             write_whole(self._row(point), row_bytes(row))
@@ -243,6 +243,6 @@ def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, 
     best = []
     for method, column in methods.items():
         row = max((row for row in rows if row[column] is not None), key=lambda row: row[column])
-        at = told({path: row[path] for path in axes})
+        at = described({path: row[path] for path in axes})
         best.append(f"best mean PSNR of {method}: {row[column]:.2f} dB at {at}")
     return tuple(best)

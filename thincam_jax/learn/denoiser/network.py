@@ -183,11 +183,11 @@ def network_card(path: str | os.PathLike[str] = SHIPPED) -> NetworkCard:
     """Card of a network's file. **Errors**: as of `load_network`."""
     path = _SHIPPED_FILE if str(path) == SHIPPED else path
     description = network_description(path)
-    told = description["training"]
+    training = description["training"]
     try:
-        uses = told.get("images", {}).items()
+        uses = training.get("images", {}).items()
         images = {use: tuple(Entry(**one) for one in entries) for use, entries in uses}
-        numbers = tuple(told.get("scores", ())), float(told.get("cpu_seconds", 0.0))
+        numbers = tuple(training.get("scores", ())), float(training.get("cpu_seconds", 0.0))
         return NetworkCard(_options(description), images, *numbers)
     except Exception as error:  # whatever another's card holds
         raise CheckpointError(f"{path}: card of another version ({of_error(error)})") from None

@@ -166,14 +166,14 @@ def train_denoiser(
     state = begun = TrainingState.begin(network, task, options)
     if folder is not None:
         widths, blocks = network.shape
-        told = _described(lessons, options)
-        settings = {"widths": widths, "blocks": blocks, **told}
+        record = _described(lessons, options)
+        settings = {"widths": widths, "blocks": blocks, **record}
         path = Path(folder) / STATE
         before = 0.0
         if path.exists():
             state = read_state(path, begun, settings)
             before = _seconds(path.with_name(NETWORK))
-        keep = functools.partial(_keep, path, settings, told, before - time.process_time())
+        keep = functools.partial(_keep, path, settings, record, before - time.process_time())
     return train_model(task, network, options, state=state, keep=keep, callback=callback)
 
 
@@ -192,11 +192,11 @@ def _seconds(path: Path) -> float:
         return 0.0
 
 
-def _keep(path: Path, settings, told, before: float, state: TrainingState) -> None:
+def _keep(path: Path, settings, record, before: float, state: TrainingState) -> None:
     """Write the best network with its training record, and the state from which to resume."""
     scores = [round(float(score), 5) for score in state.scores if score == score]
     seconds = round(before + time.process_time(), 1)
-    known = {**told, **state.counts, "scores": scores, "cpu_seconds": seconds}
+    known = {**record, **state.counts, "scores": scores, "cpu_seconds": seconds}
     save_network(path.parent / NETWORK, state.best, known)
     # Last: it is what training goes on from.
     write_state(path, state, settings)

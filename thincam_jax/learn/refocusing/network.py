@@ -266,8 +266,8 @@ def prepared(
     lens = jnp.sum(lens_blur(tied, radius, camera.largest_blur), axis=0, keepdims=True)
     total = jnp.sum(tied, axis=0, keepdims=True)
     relative = jnp.tensordot(stand.place, tied, axes=1, precision="highest")
-    told = constant_images(tied, noise_level(sigma), stand.position)
-    return jnp.concatenate([relative, lens, total, sharp, told])
+    constants = constant_images(tied, noise_level(sigma), stand.position)
+    return jnp.concatenate([relative, lens, total, sharp, constants])
 
 
 def read_images(prior: UNet, images: Float[Array, "image y x"], stand: Stand) -> Cleaned:

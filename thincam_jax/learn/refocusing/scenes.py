@@ -215,10 +215,10 @@ def _draw_batch(key, images, camera, options, size) -> Batch:
 
 
 def _draw_one(key, images, camera: RefocusCamera, options: SceneOptions) -> Batch:
-    drawn, told, noise = jax.random.split(key, 3)
+    drawn, others, noise = jax.random.split(key, 3)
     scene = draw_scene(drawn, images, camera, options)
     emission = scene.emission(camera)
-    numbers = jax.random.uniform(told, (5,), camera.near.dtype)
+    numbers = jax.random.uniform(others, (5,), camera.near.dtype)
     capture, deviation = _noisy(
         numbers[:2], noise, captured(camera, emission, scene.inverse), options
     )

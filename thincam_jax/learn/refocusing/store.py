@@ -30,7 +30,7 @@ _KIND = "refocusing network"
 # By this name the network that comes with the package is known, of configs/learned_refocus.yaml.
 SHIPPED = "shipped"
 _SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
-# Arrays of more numbers are told by their sum.
+# Arrays of more numbers are stored as their sum.
 _LISTED = 64
 # What a sensor makes of light; a network takes captures in any unit.
 _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
@@ -38,17 +38,17 @@ _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
 
 @checked
 def save(
-    path: str | os.PathLike[str], network: RefocusNetwork, told: dict[str, Any] | None = None
+    path: str | os.PathLike[str], network: RefocusNetwork, record: dict[str, Any] | None = None
 ) -> Path:
-    """Write a network: its camera, its options, what is `told` of its training, and its weights.
+    """Write a network: its camera, its options, the `record` of its training, and its weights.
 
-    `told`: JSON, such as the manifest of the images, their licences, and scores.
+    `record`: JSON, such as the entries of the images, their licences, and scores.
     """
     description = {
         "kind": _KIND,
         "camera": described(network.camera),
         "options": dataclasses.asdict(network.options),
-        "training": told or {},
+        "training": record or {},
     }
     return write_arrays(path, network.weights, description)
 

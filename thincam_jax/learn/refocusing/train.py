@@ -124,11 +124,11 @@ def train(
     """
     count = network.options.steps
     each = dataclasses.replace(options, steps=-(-options.steps // count))
-    told = _described(lessons, options)
+    record = _described(lessons, options)
     settings = {
         "camera": described(network.camera),
         "options": dataclasses.asdict(network.options),
-        **told,
+        **record,
     }
     losses, scores, trained = [], [], None
     for number in range(count):
@@ -138,7 +138,7 @@ def train(
         keep = tell = None
         if folder is not None:
             path, own = Path(folder) / STATE.format(number + 1), {**settings, "step": number}
-            keep = functools.partial(_keep, path, part, own, told)
+            keep = functools.partial(_keep, path, part, own, record)
             if path.exists():
                 state = read_state(path, begun, own)
         if callback is not None:
@@ -163,12 +163,12 @@ def _described(lessons: Lessons, options: TrainingOptions) -> dict[str, Any]:
     return {"images": as_json(lessons.images), **drawn, **described}
 
 
-def _keep(path: Path, network: RefocusNetwork, settings, told, state: TrainingState) -> None:
+def _keep(path: Path, network: RefocusNetwork, settings, record, state: TrainingState) -> None:
     """Writes what is to be kept of the training of a network's last U-Net."""
     number = network.options.steps - 1
     best = network.with_prior(number, eqx.combine(state.best, network.weights.prior[number]))
     scores = [float(score) for score in state.scores if score == score]
-    save(path.parent / NETWORK, best, {**told, "scores": scores, **state.counts})
+    save(path.parent / NETWORK, best, {**record, "scores": scores, **state.counts})
     # Last: it is what training goes on from.
     write_state(path, state, settings)
 

@@ -13,7 +13,7 @@ lattice of n points, whose error falls as 1/n, too. Some rows and columns of the
 of the whole.
 
 Samples do not widen the window, whose band limit cuts the waves far behind a small mask: some 0.5 %
-of the PSF at a Fresnel number w²/(λd) of 6, 10 % at 1. That is told by rows and columns of the
+of the PSF at a Fresnel number w²/(λd) of 6, 10 % at 1. That is judged by rows and columns of the
 mask's middle, propagated each by itself in a window of four times the width, too: to a factor of 3.
 """
 
