@@ -259,9 +259,7 @@ def test_errors_hold_where_the_model_does_not():
 @pytest.mark.thorough
 def test_a_wide_interval_is_told(diffuser):
     found = replace(diffuser.check(diffuser.psf(), search=0.02), scale=1.015, scale_error=0.008)
-    assert str(found).endswith(
-        "your PSF fits; 0.999 to 1.031 times its size cannot be told apart"
-    )
+    assert str(found).endswith("your PSF fits; 0.999 to 1.031 times its size cannot be told apart")
 
 
 @pytest.mark.thorough

@@ -206,3 +206,17 @@ def test_says_what_the_psf_of_the_axis_leaves_out():
     assert told.startswith("at 45°, the corner of the field, the PSF is some 12 % off")
     assert tiny.study(targets=(near,), field_tolerance=1e-2).warnings == []
     assert tiny.study(targets=(far,)).warnings == []
+
+
+@pytest.mark.thorough
+def test_two_distances_gain_decibels_in_the_quick_study():
+    """Method A over the better conventional camera; both methods halve what is resolved."""
+    result = build_study(load_experiment(ROOT / "configs" / "quick.yaml")).run()
+    psnr, resolved = {}, {}
+    for name, method in result.scores.methods.items():
+        psnr[name] = method.targets["astronaut"].psnr_db
+        resolved[name] = method.targets["USAF-1951"].resolved.object_mm
+    usual = [name for name in psnr if name.startswith("conventional")]
+    assert psnr["method A"] - max(psnr[name] for name in usual) > 2
+    for name in ("method A", "method B"):
+        assert resolved[name] <= min(resolved[one] for one in usual) / 2 + 1e-3

@@ -10,6 +10,7 @@ import pytest
 from commands.pages import assert_says_its_result
 from commands.screen import tiny
 from commands.study.tiny import Told
+from PIL import Image
 from studies import tiny_screen
 
 from helpers import ROOT
@@ -80,6 +81,12 @@ def test_a_file_of_a_full_colour_hologram(tmp_path):
     study = build_screen(tiny.experiment(tmp_path, *overrides, "calibration=null"))
     np.testing.assert_allclose(study.wavelengths[0] / study.wavelengths[1], 630 / 532, rtol=1e-6)
     assert len(study.cameras) == 3 and study.targets["face"].shape == (8, 16, 3)
+    run_screen(study, RunFolder(tmp_path / "out"), Told())
+    pictures = [np.asarray(Image.open(path)) for path in (tmp_path / "out/images").iterdir()]
+    assert pictures and all(picture.shape == (8, 16, 3) for picture in pictures)
+    assert all(np.ptp(picture.astype(int), axis=-1).max() > 20 for picture in pictures)
+    score = stored(tmp_path / "out")["models"]["right"]["methods"]["CGM"]["mean_psnr_db"]
+    assert score > 20
 
 
 def test_the_angle_of_a_file_is_the_tilt_of_the_plate(tmp_path):
