@@ -65,7 +65,7 @@ def draw_found(
 def draw_captures(study: Study, captures: Mapping[Exposure, Capture]) -> Figure:
     """All captures of a target, each from black to its own maximum."""
     aspect = study.sensor.shape[0] / study.sensor.shape[1]
-    figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.6)
+    figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.9)
     for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=True), 1):
         image = captures[exposure].image
         title = f"{number}: {study.mask_of(exposure)},\n"
@@ -103,7 +103,7 @@ def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
     low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
     _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
     width = study.sensor.shape[1] * study.pitch / 3
-    ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
+    ax.set_xlabel(f"middle {width:.2g} mm,\nstretched", fontsize=9)
 
 
 # The second layer of the USAF chart, with the finer ones inside: place of its centre down and right
