@@ -45,6 +45,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
+html_context = {"default_mode": "auto"}  # light or dark as the reader's system
 html_sidebars = {"index": [], "start": [], "contributing": []}
 
 autodoc_typehints = "none"

@@ -219,6 +219,13 @@ def test_pages_are_few_and_listed():
     assert len(pages()) <= 25
 
 
+def test_pages_begin_with_a_picture():
+    """Before their second heading."""
+    contributing = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    for page, text in (pages() | {"contributing.md": contributing}).items():
+        assert "![" in re.split(r"^##", text, maxsplit=1, flags=re.MULTILINE)[0], page
+
+
 def test_links_between_pages_lead_somewhere():
     """To files that are there; the scripts' pages and the reference are made with the site."""
     for page, text in pages().items():

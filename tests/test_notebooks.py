@@ -59,3 +59,35 @@ def test_a_script_as_a_notebook(script, tmp_path, monkeypatch):
     cells = cells_of(script)
     shown = pictures_of(cells, tmp_path, monkeypatch)
     assert len(shown) == len(set(shown)) == {"in_a_notebook": 5, "real_capture": 2}[script]
+
+
+WIDGET = """
+import thincam_jax as tc
+from thincam_jax.units import um
+mask = tc.FresnelZoneAperture(25.0, width=1.6)
+explorer = tc.explore(tc.LenslessCamera(mask, tc.Sensor((48, 64), 30 * um), distance=5.0))
+explorer
+"""
+TURNED = """
+import json
+sent = []
+explorer.send = lambda content, buffers: sent.append((content, buffers))
+# What the page's module sends over the notebook's comm.
+asked = {"id": 1, "values": {"beta": 18.0}, "rest": False}
+message = {"content": {"data": {"method": "custom", "content": asked}}, "buffers": []}
+explorer._handle_msg(message)
+camera = explorer.camera
+tc.plot.psf(camera, **explorer.light)
+"""
+CHECKED = """
+assert "application/vnd.jupyter.widget-view+json" in str(explorer._repr_mimebundle_())
+((content, pictures),) = sent
+assert json.loads(content["header"])["values"]["beta"] == float(camera.mask.beta) == 18.0
+assert pictures[0][:2] == b"\\xff\\xd8" and camera.distance == 5.0
+"""
+
+
+def test_the_explorer_in_a_notebook(tmp_path, monkeypatch):
+    """A widget's view, a move, and the camera as it is set in the next cell."""
+    pytest.importorskip("anywidget", reason="anywidget is not installed")
+    assert len(pictures_of([WIDGET, TURNED, CHECKED], tmp_path, monkeypatch)) == 1

@@ -27,16 +27,19 @@ def browser():
 
 @pytest.fixture(scope="module")
 def view(browser):
-    """A page whose requests are listed; a site that is not built is skipped, not passed."""
+    """A page that lists requests and faults; a site that is not built is skipped, not passed."""
     view = browser.new_page()
-    view.asked = []
+    view.asked, view.faults = [], []
     view.on("request", lambda request: view.asked.append(request.url))
+    view.on("pageerror", lambda error: view.faults.append(str(error)))
+    view.on("console", lambda said: said.type == "error" and view.faults.append(said.text))
     return view
 
 
 def fits(view, page, *widths):
     """No wider than a phone or a screen, the bar at most 64 pixels high; only files are read."""
     view.asked.clear()
+    view.faults.clear()
     for width in widths:
         view.set_viewport_size({"width": width, "height": 900})
         if width == widths[0]:
@@ -44,6 +47,7 @@ def fits(view, page, *widths):
         assert view.evaluate("document.documentElement.scrollWidth") <= width
         assert view.evaluate("document.querySelector('.bd-header').offsetHeight") <= 64
     assert not [url for url in view.asked if not url.startswith(("file:", "data:", "blob:"))]
+    assert not view.faults, page
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if NAME not in p] or ["index.html"])

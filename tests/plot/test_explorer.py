@@ -3,14 +3,18 @@
 import io
 import json
 import re
+import tomllib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import PIL.Image
 import pytest
+from jax import monitoring
 
 import thincam_jax as tc
-from thincam_jax.plot import explorer as module
+from helpers import ROOT
+from thincam_jax.plot.explore import MODULE
 from thincam_jax.plot.explorer import Explorer
 from thincam_jax.units import nm, um
 
@@ -85,13 +89,23 @@ def test_at_rest_come_capture_image_and_model(explorer):
     assert json.loads(header)["names"] == [*view.pictures] and len(pictures) == 3
 
 
-def test_moving_compiles_nothing(explorer):
+@pytest.mark.parametrize("moves", [20, pytest.param(200, marks=pytest.mark.thorough)])
+def test_moving_compiles_nothing(explorer, moves):
+    """Each control in turn, with the programs of JAX counted."""
+    compiled = []
+    monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
+    )
+    explorer.turn({"beta": 9.0})
     explorer.view(rest=False)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module.psfs, "psf_about_ray", None)  # a new trace would call it
-        for beta in np.linspace(10, 40, 20):
-            explorer.turn({"beta": beta, "width": 5.0 + beta / 100, "phase": beta / 40})
-            explorer.view(rest=False)
+    before, controls = len(compiled), explorer.controls
+    for move in range(moves):
+        one, part = controls[move % len(controls)], (move + 0.5) / moves
+        explorer.turn({one.name: one.low + part * (one.high - one.low)})
+        explorer.view(rest=False)
+    assert len(compiled) == before and explorer._moving._cache_size() == 1
+    jax.jit(lambda x: x + before)(0.0)
+    assert len(compiled) > before  # they are counted
 
 
 @pytest.mark.thorough
@@ -143,4 +157,22 @@ def test_the_widget_answers_what_its_module_asks(monkeypatch):
     assert float(widget.camera.mask.beta) == 15.0 and set(widget.light) == {
         "wavelength",
         "object_distance",
+    }
+
+
+def test_the_module_of_the_widget_needs_no_build():
+    """What it imports and exports: nothing, and what the widget and the pages call."""
+    text = MODULE.read_text("utf-8")
+    assert not re.search(r"^\s*import\b|\bimport\s*\(|\brequire\s*\(|\bfrom\s+[\"']", text, re.M)
+    assert re.findall(r"^export (\w+ \w*)", text, re.M) == [
+        "function mount",
+        "function byFetch",
+        "default ",
+    ]
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    assert {re.match(r"\w+", one)[0] for one in extras["notebook"]} == {
+        "anywidget",
+        "starlette",
+        "uvicorn",
     }

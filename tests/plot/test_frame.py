@@ -18,3 +18,14 @@ def test_letters_have_twelve_pixels_where_a_page_shows_them(width):
     shown = min(110, 850 / width) / 72
     sizes = [text.get_fontsize() * shown for text in figure.findobj(Text) if text.get_text()]
     assert len(sizes) > 8 and min(sizes) > 11.99
+
+
+def test_titles_do_not_run_into_each_other():
+    """Six beside each other are small on a page: theirs are broken, after commas."""
+    figure, axes = drawing((16.5, 3.5), 1, 6)
+    for ax in axes:
+        ax.set_title("conventional, d = 5.0 mm\n15.7 dB")
+    as_png(figure)
+    assert {ax.get_title() for ax in axes} == {"conventional,\nd\xa0=\xa05.0\xa0mm\n15.7\xa0dB"}
+    boxes = [ax.title.get_window_extent() for ax in axes]
+    assert all(a.x1 < b.x0 for a, b in zip(boxes, boxes[1:], strict=False))

@@ -1,6 +1,7 @@
 """How pictures are laid out: what is read, not how it looks."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -45,20 +46,36 @@ def test_the_detail_of_a_chart_holds_its_fine_groups():
     assert enlarged_part(image, picture)[1] == "middle 27 mm"
 
 
-def test_panels_of_transfer_functions_share_frequencies_and_show_limits():
+def test_panels_of_transfer_functions_end_past_their_limits_and_go_to_1():
+    """No panel is half empty, and a title says what of a curve is above it."""
     study = tiny.study()
     limits = Limits(None, None, 9.0, 3.7)
     found = {
         m.name: Response(np.arange(50.0) / 4, np.linspace(1, 3 - 2 * n, 50), limits)
         for n, m in enumerate(study.methods)
     }
-    panels = draw_responses(study, found).axes
-    assert {ax.get_xlim() for ax in panels} == {(0, 1.3 * 10.8)}  # of the published limit
-    # From 0 to 1, or to the largest where that is above 1.
-    assert [ax.get_ylim()[1] > 1.05 for ax in panels] == [True, False]
+    figure = draw_responses(study, found)
+    panels = figure.axes
+    assert [ax.get_xlim()[1] for ax in panels] == pytest.approx([1.15 * 10.8, 1.15 * 9.0])
+    assert {ax.get_ylim() for ax in panels} == {(0, 1.05)}
+    first, second = (ax.get_title(loc="left") for ax in panels)
+    assert re.fullmatch(r".*, up to \d\.\d\d at 12\.2", first) and "up to" not in second
     first, second = ([t.get_text() for t in ax.get_legend().get_texts()] for ax in panels)
-    assert first == ["cut-off 9.0", "Nyquist 12.5", "published limit 10.8"]
-    assert second == ["cut-off 9.0", "Nyquist 12.5"]
+    assert first == ["cut-off 9.0", "published limit 10.8"] and second == ["cut-off 9.0"]
+    figure.draw_without_rendering()
+    for ax in panels:  # beside the curves, not over them
+        assert ax.get_legend().get_window_extent().x0 >= ax.get_window_extent().x1
+
+
+def test_a_panel_without_limits_goes_past_the_nyquist_frequency():
+    study = tiny.study()
+    none = Response(np.arange(50.0) / 4, np.ones(50), Limits(None, None, 0.0, 0.0))
+    panels = draw_responses(study, {m.name: none for m in study.methods}).axes
+    assert panels[1].get_xlim()[1] == pytest.approx(1.08 * 0.5 / study.pitch)
+    assert [t.get_text() for t in panels[1].get_legend().get_texts()] == [
+        "cut-off 0.0",
+        "Nyquist 12.5",
+    ]
 
 
 def test_methods_of_the_same_captures_and_sums_share_a_transfer_function():

@@ -4,7 +4,7 @@ What a plate is worth is the expected error of the best linear reconstruction. A
 capture is locally the object convolved with the pixel's ghosts, their smear included, so that with
 the points :math:`\mathbf P_{is}` and the weights :math:`W_i` of `waveguide.trace_band`
 
-.. math:: H(\boldsymbol\nu) = \sum_i \frac{W_i}{S}\sum_s e^{2\pi j\,\boldsymbol\nu\cdot
+.. math:: H(\pmb\nu) = \sum_i \frac{W_i}{S}\sum_s e^{2\pi j\,\pmb\nu\cdot
     (\mathbf P_{is} - \mathbf P_{00})}, \qquad
     \frac{\epsilon}{\mathrm{var} f} = \Big\langle \frac{\int d^2\nu\,
     [1/\eta_f + |H|^2/\eta_n]^{-1}}{\int d^2\nu\,\eta_f} \Big\rangle

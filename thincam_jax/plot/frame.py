@@ -2,6 +2,8 @@
 
 import io
 import math
+import re
+import textwrap
 from typing import Any
 
 import matplotlib.figure
@@ -115,12 +117,22 @@ def sheet(
 
 
 def as_png(figure: matplotlib.figure.Figure) -> bytes:
-    """Content of a PNG file of a figure, no letters below 12 pixels where it is 850 pixels wide."""
-    least = 72 * 12 / min(110, 850 / figure.get_figwidth())
+    """Content of a PNG file of a figure, no letters below 12 pixels where it is 850 pixels wide.
+
+    Titles and labels wider than their panel are broken, after commas.
+    """
+    width = figure.get_figwidth()
+    least = 72 * 12 / min(110, 850 / width)
     for text in figure.findobj(Text):
         text.set_fontsize(max(text.get_fontsize(), least))
     for ax in figure.axes:
         ax.tick_params(labelsize=max(10, least))
+        if (place := ax.get_subplotspec()) is not None:
+            inches = width * len(place.colspan) / place.get_gridspec().ncols
+            for text in (ax.title, ax.xaxis.label):
+                most = max(1, int(72 * inches / (0.58 * text.get_fontsize())))
+                lines = re.sub("(?<!,) ", "\xa0", text.get_text()).splitlines()
+                text.set_text("\n".join(textwrap.fill(line, most) for line in lines))
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

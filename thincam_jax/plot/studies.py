@@ -65,7 +65,7 @@ def draw_found(
 def draw_captures(study: Study, captures: Mapping[Exposure, Capture]) -> Figure:
     """All captures of a target, each from black to its own maximum."""
     aspect = study.sensor.shape[0] / study.sensor.shape[1]
-    figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.6)
+    figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.9)
     for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=True), 1):
         image = captures[exposure].image
         title = f"{number}: {study.mask_of(exposure)},\n"
@@ -103,7 +103,7 @@ def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
     low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
     _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
     width = study.sensor.shape[1] * study.pitch / 3
-    ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
+    ax.set_xlabel(f"middle {width:.2g} mm,\nstretched", fontsize=9)
 
 
 # The second layer of the USAF chart, with the finer ones inside: place of its centre down and right
@@ -134,27 +134,26 @@ def _middle(image: np.ndarray) -> np.ndarray:
 def draw_responses(
     study: Study, responses: Mapping[str, Response], figure: Figure | None = None
 ) -> Figure:
-    """Transfer functions of all methods over one axis; methods of one synthesis share a panel.
+    """Transfer functions of all methods, from 0 to 1; methods of one synthesis share a panel.
 
-    With their limits and those that are published, to a third beyond the highest.
+    With their limits and those that are published, to a seventh beyond the highest of the panel,
+    whose title says how far a curve goes above 1, and where.
     """
     published = {m.name: m.published.limit_cycles_per_mm for m in study.methods}
     nyquist = 0.5 / study.pitch
     panels = _by_synthesis(study, responses)
-    size = (8.5, 2.1 * len(panels) + 0.8)
-    drawn, axes = drawing(size, len(panels), 1, figure=figure, sharex=True)
+    size = (8.5, 2.3 * len(panels) + 0.8)
+    drawn, axes = drawing(size, len(panels), 1, figure=figure)
     axes = np.atleast_1d(axes)
-    known = [r.limits.cut_off_cycles_per_mm for _, r in panels]
-    end = 1.3 * max(limit or 0 for limit in (*known, *published.values()))
-    end = end or 1.08 * nyquist
-    levels = [r.magnitude[1:] / low_frequency_value(r.frequency, r.magnitude) for _, r in panels]
     for index, (ax, (name, response)) in enumerate(zip(axes, panels, strict=True)):
-        style = line_style(index) | {"marker": "", "linestyle": "-"}
-        ax.plot(response.frequency[1:], levels[index], linewidth=1.1, **style)
-        ax.axvspan(min(nyquist, end), end, color="#d8d8d8", linewidth=0)
         limits = response.limits
         zero, cut = limits.first_zero_cycles_per_mm, limits.cut_off_cycles_per_mm
         stated = {limit for own in name.split("; ") if (limit := published.get(own))}
+        end = 1.15 * max(cut, 0, *stated) or 1.08 * nyquist
+        u, levels = response.frequency[1:], response.magnitude[1:]
+        levels = levels / low_frequency_value(response.frequency, response.magnitude)
+        ax.plot(u, levels, linewidth=1.1, **line_style(index) | {"marker": "", "linestyle": "-"})
+        ax.axvspan(min(nyquist, end), end, color="#d8d8d8", linewidth=0)
         marks = [("first zero", zero, ":"), ("cut-off", cut, "--")]
         marks += [("Nyquist", nyquist, "-")] if nyquist < end else []
         marks += [("published limit", limit, "-.") for limit in sorted(stated)]
@@ -162,10 +161,11 @@ def draw_responses(
             if at is not None:
                 label = f"{what} {at:.1f}"
                 ax.axvline(at, color="black", linestyle=dash, linewidth=1, label=label)
-        ax.legend(fontsize=8, loc="upper right", framealpha=0.9)
-        top = max(1.0, float(levels[index][response.frequency[1:] < end].max()))
-        ax.set(xlim=(0, end), ylim=(0, 1.05 * top), ylabel="relative MTF")
-        ax.set_title(name, fontsize=10, loc="left")
+        ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
+        ax.set(xlim=(0, end), ylim=(0, 1.05), ylabel="relative MTF")
+        top = np.argmax(np.where(u < end, levels, 0))
+        above = f", up to {levels[top]:.2f} at {u[top]:.1f}" if levels[top] > 1.05 else ""
+        ax.set_title(f"{name}{above}", fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
     return drawn
 

@@ -5,13 +5,13 @@ the place of the lens, so that a `SeeThroughCamera` with `focal_distance` d desc
 "pinhole" is the middle of the mask. Layers are parallel and holograms shift-invariant, hence light
 of direction cosines **t** that crosses the mask at **m** comes, by order i, from the object at
 
-.. math:: \mathbf P = \mathbf m + \boldsymbol\Delta_i(\mathbf u), \qquad
+.. math:: \mathbf P = \mathbf m + \pmb\Delta_i(\mathbf u), \qquad
     \mathbf u = -d\,\mathbf t/\sqrt{1-t^2}
 
 with Δ_i the object point of `trace` for the pixel **u**, and meets the sensor at **m** + **u**. So
 
 .. math:: g(\mathbf x) = \int |t(\mathbf m)|^2 \sum_i W_i(\mathbf u)\,
-    f(\mathbf m + \boldsymbol\Delta_i(\mathbf u))\, d\mathbf m
+    f(\mathbf m + \pmb\Delta_i(\mathbf u))\, d\mathbf m
 
 in ray optics, with **u** = **x** − **m**. An object point is imaged by each order, through the
 middle of the mask, at the **u**_i with Δ_i(**u**_i) = **P**. About it Δ_i is linear, −T_i/d: the
@@ -19,7 +19,7 @@ light seems to come from a source T_i before the mask, and casts the shadow of t
 1 + d/T_i. With the diffraction at the mask, the point spread function is
 
 .. math:: h(\mathbf x; \mathbf P) = \sum_i W_i(\mathbf u_i)\,
-    \frac{\det\boldsymbol\Delta_0'}{\det(\boldsymbol\Delta_i' - 1)}\,
+    \frac{\det\pmb\Delta_0'}{\det(\pmb\Delta_i' - 1)}\,
     h_\mathrm{mask}(\mathbf x - \mathbf u_i;\ \lambda_C(\mathbf u_i), T_i)
 
 Orders add up as irradiances: their paths differ by millimetres, and the band of the film leaves a

@@ -34,9 +34,9 @@ _RESOLVED = (
     "of the method's largest mask–sensor distance."
 )
 _TRANSFER = (
-    "Response of each method's synthesis with the finite mask, over its low-frequency value. "
-    "Above 1, fringes of the finite mask's edge, or of several captures, add up to more than that. "
-    "Grey: beyond the pixels' Nyquist frequency, 1/(2 pitch), which no capture holds."
+    "Response of each method's synthesis with the finite mask, over its low-frequency value. Above "
+    "1 (a title says how far) fringes of the mask's edge or of several captures add up to more. "
+    "Each panel has its own range. Grey: beyond the Nyquist frequency, which no capture holds."
 )
 _CONTRAST = (
     "Contrast of the chart's elements in the reconstructions; below zero the bars are reversed."
@@ -169,7 +169,7 @@ def _pictures(target: str, scores: StudyScores) -> tuple[Gallery, Gallery, Pictu
     place = f"../images/{slug(target)}--"
     wholes = [
         Picture(f"{place}capture.png", f"{target} as shadows of the mask", "first raw capture"),
-        Picture(f"{place}scene.png", target, f"{target}, the scene"),
+        Picture(f"{place}scene.png", f"{target}, the scene", f"{target}, the scene"),
     ]
     details = [Picture(f"{place}scene--detail.png", f"Part of {target}", "scene, enlarged")]
     for name, method in scores.methods.items():

@@ -81,7 +81,7 @@ def propagate_along(
 
     .. math::
         \sqrt{c^2 - 2\mathbf s\cdot\mathbf q - q^2} - c + \mathbf s\cdot\mathbf q/c, \qquad
-        \mathbf q = \lambda\boldsymbol\nu,
+        \mathbf q = \lambda\pmb\nu,
 
     formed without the parts that cancel. The window is then moved to the sensor's samples; what
     lies beyond it is dark.

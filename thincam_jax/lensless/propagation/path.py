@@ -28,8 +28,8 @@ class Path(Module):
     mask's scale is then
 
     .. math::
-        U(\mathbf u) = \frac{\sqrt{\det B}}{j\pi} \int t(\boldsymbol\xi)\,
-            e^{j(\mathbf u-\boldsymbol\xi)^T B (\mathbf u-\boldsymbol\xi)}\,d^2\xi,
+        U(\mathbf u) = \frac{\sqrt{\det B}}{j\pi} \int t(\pmb\xi)\,
+            e^{j(\mathbf u-\pmb\xi)^T B (\mathbf u-\pmb\xi)}\,d^2\xi,
         \qquad B = \frac{\pi M c}{\lambda d}\,(I - \mathbf s\mathbf s^T)
 
     for d/c along the ray: d/c³ in the plane of incidence and d/c across it, the same M.

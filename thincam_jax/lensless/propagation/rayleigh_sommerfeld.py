@@ -21,9 +21,9 @@ def rayleigh_sommerfeld_field(
     r"""First Rayleigh-Sommerfeld integral as a midpoint sum over the samples of the mask plane.
 
     .. math::
-        U(\mathbf r) = \frac{1}{2\pi}\sum U_0(\boldsymbol\xi)\,\frac dR
+        U(\mathbf r) = \frac{1}{2\pi}\sum U_0(\pmb\xi)\,\frac dR
             \Big(\frac1R - jk\Big)\frac{e^{jk(R-d)}}{R}\,\Delta^2,\qquad
-        R = \sqrt{d^2 + |\mathbf r-\boldsymbol\xi|^2}
+        R = \sqrt{d^2 + |\mathbf r-\pmb\xi|^2}
 
     with the piston e^{jkd} dropped and R − d formed as ρ²/(R+d). Right while neighbouring samples
     of the summand differ by less than half a turn: Δ·(ν + ρ/(λR)) < ½ for a field of local

@@ -55,13 +55,13 @@ def skew_image(
     .. math::
         \sqrt{\frac{\det B}{\det A_k}}\; e^{j k\beta\,\mathbf u^T A_k^{-1} B\,\mathbf u},
 
-    and comes from the point :math:`\boldsymbol\xi_k = A_k^{-1} B\,\mathbf u` of the mask. An edge
+    and comes from the point :math:`\pmb\xi_k = A_k^{-1} B\,\mathbf u` of the mask. An edge
     cuts it off as it does with the curvature :math:`\alpha = A_{xx} - A_{xy}^2/A_{yy}`, which the
     waves have once they are integrated along the edge:
 
     .. math::
         U_k \approx \frac{\sqrt{\det B}}{j\pi} \sqrt{1 - \frac{A_{xy}^2}{A_{xx} A_{yy}}}\;
-        e^{j k\beta\,\mathbf u^T \boldsymbol\xi_k}
+        e^{j k\beta\,\mathbf u^T \pmb\xi_k}
         \int e^{j\alpha_y(\eta - \eta_k)^2} d\eta \int e^{j\alpha_x(\xi - \xi_k)^2} d\xi.
 
     Exact for a plate without edges and for one edge alone; what is approximated are the waves of
