@@ -12,6 +12,7 @@ const STYLE = `
 .tc-pictures img, .tc-pictures canvas { width: 100%; aspect-ratio: 1; object-fit: contain; background: #000; display: block; }
 .tc-pictures canvas { background: #fff; }
 .tc-pictures figcaption { font-size: 13px; margin-top: .2rem; }
+.tc-pictures img:not([src]) { visibility: hidden; }
 .tc-stale { opacity: .45; }
 .tc-lines { margin: .8rem 0 0; min-height: 2.8em; }`;
 

@@ -130,7 +130,7 @@ def as_png(figure: matplotlib.figure.Figure) -> bytes:
         if (place := ax.get_subplotspec()) is not None:
             inches = width * len(place.colspan) / place.get_gridspec().ncols
             for text in (ax.title, ax.xaxis.label):
-                most = max(1, int(72 * inches / (0.58 * text.get_fontsize())))
+                most = max(1, int(72 * inches / (0.58 * float(text.get_fontsize()))))
                 lines = re.sub("(?<!,) ", "\xa0", text.get_text()).splitlines()
                 text.set_text("\n".join(textwrap.fill(line, most) for line in lines))
     buffer = io.BytesIO()
