@@ -15,14 +15,14 @@ from thincam_jax.units import nm, um
 # Of all cameras, so that they share their programs. The kernel's counts are odd: samples of the
 # cells below then lie between their edges.
 SENSOR, FIELD, SPOTS = (16, 20), (20, 26), 4
-_SAMPLES = 9
+_SAMPLES, _STEPS = 15, 5
 
 
 def random_case(random: np.random.Generator, kind: str):
     """A camera, a scene up to 45° wide, and a tolerance."""
     pitch = random.uniform(20, 60) * um
     distance = max(FIELD[1] / 2 * pitch, math.exp(random.uniform(math.log(0.7), math.log(8))))
-    cell = random.choice([7, 9, 11, 13]) * pitch / _SAMPLES
+    cell = random.choice([5, 7]) * pitch / _STEPS
     width = random.uniform(0.6, 1.3) * SENSOR[1] * pitch
     beta = math.pi * random.uniform(0.2, 0.9) / pitch / width
     heights = random.uniform(0, 1.0, (11, 11)) * um

@@ -10,8 +10,7 @@ points along each axis, by the same model as that of the axis.
 
 import functools
 import math
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Complex
@@ -43,7 +42,8 @@ _CORNERS = 2.0
 _FOUND = 1 / 3
 
 
-class _Change(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Change:
     """H of the axis, and A of its change in parts of the field's edge."""
 
     middle: Complex[np.ndarray, " k"]
@@ -132,10 +132,10 @@ def _errors(seen: SeenScene, changes: list[_Change]) -> tuple[float, float]:
     parts = [t / edge for t, edge in edges]
     weighted = [[image_spectrum(lit * p**n, seen.frequencies) for n in _POWERS] for p in parts]
     both, of_psf = 0.0, 0.0
-    for middle, powers in changes:
-        error = np.einsum("apk,apbk->bk", powers, np.array(weighted)) * seen.weights.sum()
+    for change in changes:
+        error = np.einsum("apk,apbk->bk", change.powers, np.array(weighted)) * seen.weights.sum()
         of_psf = max(of_psf, seen.relative(error))
-        both = max(both, seen.relative(error + middle * dimmed * seen.weights.sum()))
+        both = max(both, seen.relative(error + change.middle * dimmed * seen.weights.sum()))
     return both, of_psf
 
 
