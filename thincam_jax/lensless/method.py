@@ -96,8 +96,9 @@ class PsfMethod:
 
     - `model`: "geometric", "paraxial", "closed_form", "separable", "radial", "angular_spectrum" or
       "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`. "separable",
-      the default, is "radial" of rings, and "angular_spectrum" of rings off the axis and of cells
-      off both axes, with samples that leave about 1 %, 7 a pixel of traced numbers.
+      the default, is "radial" of rings, and "angular_spectrum" of rings off the axis and, off both
+      axes, of cells and of zones that focus on a line there, with samples that leave about 1 %, 7 a
+      pixel of traced numbers.
     - `precision`: "float32" or "float64", in which to compute; the result comes back in the
       camera's own, which is also the default. Double precision needs no setting of JAX's.
     - `pixel_integration`: average over each pixel, where the function that is called would not.

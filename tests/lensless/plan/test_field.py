@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from lensless.plan import spots
 
 import thincam_jax as tc
 from helpers import relative_l2
@@ -77,6 +78,27 @@ def test_predictions_hold_over_random_cameras():
     assert np.mean(true <= predicted) > 0.95
     assert np.mean(predicted <= 10 * true) > 0.7
     assert met.all() and set(choice) == {0, 1, 2}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["mura", "random"])
+def test_predictions_hold_for_other_masks(kind):
+    """Those of 200, phase masks among them, are in `benchmarks/test_field_plans.py`."""
+    _, predicted, true, choice, _ = spots.errors(4, seed=20261126, kind=kind).T
+    assert np.all(true <= predicted) and np.all(predicted <= 10 * true)
+    assert set(choice) <= {0, 1, 2}
+
+
+def test_lenses_over_the_field():
+    """A spot far along an axis, where the PSF is exact; the axis' PSF alone cannot serve."""
+    mask = tc.LensletArray(3.0, 0.4, (2, 2))
+    camera = tc.LenslessCamera(mask, tc.Sensor((8, 9), 60 * um), 3.0)
+    image = np.zeros((9, 31))
+    image[4, 1] = 1.0
+    scene = tc.Scene(tc.ImagePlane(image, 100.0, 31 * 60 * um / 3 * 100), 500 * nm)
+    plan = tc.plan(camera, scene, tolerance=0.05)
+    assert plan.shares["field"] > 0.05 and not plan.meets_tolerance
+    assert not any(effect.name == "shift-variance" for effect in plan.effects)
 
 
 def wide(planes: int, colours: int):

@@ -127,7 +127,7 @@ def _quick(seen: SeenScene, method: PsfMethod, wavelength: float, distance: floa
     own = replace(method, nodes=_FEW_NODES if few else PIXEL_NODES, field_tolerance=None)
     probe = seen.probe
     found = [probe.quick(wavelength, distance, own)]
-    if method.field_tolerance is not None and isinstance(probe, TransferProbe):
+    if method.field_tolerance is not None:
         edges = (seen.point(distance, axis) for axis in (0, 1))
         found += [probe.quick(wavelength, distance, own, at) for at in edges]
     return np.concatenate(found)

@@ -37,15 +37,15 @@ def plan(
     PSFs' transfer functions at a few hundred frequencies, weighted with the scene's own spectrum:
 
     - the model, the precision and whether pixels must be averaged, or the samples a pixel;
-    - of zone plates, whether every point of the field needs its own PSF and light
-      (`field_operator`), or the PSF and the light of the axis suffice;
+    - whether every point of the field needs its own PSF and light (`field_operator`; not of
+      lenses), or the PSF and the light of the axis suffice;
     - how many wavelengths: some of the spectrum's, with weights that reproduce its sum;
     - how many PSFs for the planes: each plane's PSF is a weighted sum of a few planes'
       (interpolative decomposition), and planes are added up with these weights *before* they are
       convolved. Planes with nearly equal PSFs merge into one.
 
     With `over_field` False the capture is that of the axis' PSF and light, as solvers that are
-    given cameras assume it, and the error is against that; so it is for other masks. `Plan.effects`
+    given cameras assume it, and the error is against that; so it is for rings. `Plan.effects`
     then lists what changes over the field, with its size, and always shot noise and what Fresnel's
     approximation leaves out.
 

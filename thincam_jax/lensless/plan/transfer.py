@@ -21,7 +21,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.psf import closed_terms, psf
+from thincam_jax.lensless.psf import closed_terms, spectral_psf
 
 # Rings of frequencies, and frequencies in each.
 _RINGS, _IN_RING = 32, 16
@@ -164,10 +164,15 @@ class SampledProbe:
         self.frequencies = frequencies
 
     def quick(
-        self, wavelength: float, distance: float, method: PsfMethod
+        self,
+        wavelength: float,
+        distance: float,
+        method: PsfMethod,
+        at: tuple[float, float] | None = None,
     ) -> Complex[np.ndarray, " k"]:
-        """H of the PSF as a plan computes it."""
-        h = psf(self.camera, wavelength=wavelength, object_distance=distance, model=method)
+        """H of the PSF as a plan computes it; with `at`, about the ray of that point."""
+        grid = self.camera.sensor.grid
+        h = spectral_psf(self.camera, [(wavelength, 1.0)], distance, method, grid, at)
         return image_spectrum(np.asarray(h, float)[None], self.frequencies)[0]
 
 
