@@ -83,7 +83,7 @@ def test_predictions_hold_over_random_cameras():
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["mura", "random"])
 def test_predictions_hold_for_other_masks(kind):
-    """Those of 200, phase masks among them, are in `benchmarks/test_field_plans.py`."""
+    """Many more, phase masks among them, are in `benchmarks/test_field_plans.py`."""
     _, predicted, true, choice, _ = spots.errors(4, seed=20261126, kind=kind).T
     assert np.all(true <= predicted) and np.all(predicted <= 10 * true)
     assert set(choice) <= {0, 1, 2}

@@ -39,7 +39,7 @@ _CELLS = 0.03
 # What the two axes tell of the corners' changes behind masks without zones.
 _CORNERS = 2.0
 # The largest error found over random cameras, in parts of the sum of the errors allowed.
-_FOUND = 1 / 3
+_FOUND = 1 / 2
 
 
 @dataclass(frozen=True, eq=False)
