@@ -2,7 +2,7 @@
 
 Each pattern carries a fiducial, its number in base 256 in the first pixels; the camera sees what is
 shown with a texture of its own, so that a frame tells of which pattern it is, whole. It imports no
-JAX: `python memory_rig.py STORE FRAMES [rows|stays]` is the process that tests kill.
+JAX: `python memory_rig.py STORE FRAMES [rows|stays|pictures|scene]` is the process that tests kill.
 """
 
 import itertools
@@ -27,7 +27,7 @@ from thincam_jax.hardware import (
     Stage,
     Timeout,
 )
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step, pictures, scene
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.errors import OutOfRange
 from thincam_jax.hardware.virtual.faults import Faults
@@ -51,6 +51,7 @@ class World:
         self.unplugs: str | None = None  # the device that "unplug" is for; None: any
         self.light = 1.0
         self.serial, self.limits = "1", (0.0, 50.0)
+        self.exposed: list[tuple[int, float]] | None = None  # fiducial and exposure of each frame
 
     def open(self, kind):
         role = kind.__name__.removeprefix("Memory").lower()
@@ -71,8 +72,7 @@ class World:
     def render(self, pattern: Pattern) -> np.ndarray:
         levels = np.zeros(self.shape, np.uint8)
         if pattern != BLACK:
-            number = int(pattern.numbers["number"]) + 1
-            levels[0, :4] = [number // 256**digit % 256 for digit in range(4)]
+            levels[0, :4] = digits(number_of(pattern) + 1)
         return levels
 
     def see(self, exposure: float) -> np.ndarray:
@@ -89,6 +89,16 @@ class World:
 
     def unplugged(self, role: str) -> Disconnected:
         return Disconnected(role, "use", "it is not there any more", "plug it in")
+
+
+def digits(number: int) -> list[int]:
+    """A number in base 256, the lowest digit first."""
+    return [number // 256**place % 256 for place in range(4)]
+
+
+def number_of(pattern: Pattern) -> int:
+    """The number of a pattern that is not black; pictures are named by it."""
+    return int(pattern.numbers.get("number", pattern.numbers.get("name", 0)))
 
 
 def fiducial(pixels: np.ndarray) -> int:
@@ -160,6 +170,9 @@ class MemoryCamera(MemoryDevice, Camera):
         if self.world.faults.due("dropped_frame"):
             raise Timeout("camera", "trigger", f"no frame within {timeout} s", "wait longer")
         pixels = self.world.see(self.settings.exposure)
+        if self.world.exposed is not None:
+            pixels[1, :4] = digits(len(self.world.exposed))
+            self.world.exposed.append((fiducial(self.world.shown), self.settings.exposure))
         region = self.settings.region
         rows = slice(region.top, region.top + region.height)
         pixels = pixels[rows, region.left : region.left + region.width]
@@ -239,15 +252,32 @@ def by_rows(plan: Plan) -> Plan:
     return replace(plan, facts={"series": series})
 
 
+def picture_plan(count: int, frames: int = 4) -> Plan:
+    """Pictures on the cells, several frames of each, and dark frames among them."""
+    shown = {str(number): np.full((2, 3), number, np.int32) for number in range(count // frames)}
+    return pictures(shown, SETTINGS, frames=frames, dark_frames=count // 8)
+
+
+def scene_plan(count: int) -> Plan:
+    """Three exposures of one pattern, the longer ones saturated in part, and their dark frames."""
+    exposures, mask = (0.01, 0.03, 0.1), Pattern("fiducial", {"number": 0})
+    numbers = {"frames": count // 3, "dark_frames": count // 6}
+    return scene(mask, SETTINGS, exposures=exposures, **numbers)
+
+
 if __name__ == "__main__":
     from jax._src import xla_bridge
 
     from thincam_jax.hardware.acquisition.acquire import acquire
 
-    plan = fiducial_plan(int(sys.argv[2]), dark_every=16)
-    kinds = {"rows": by_rows, "stays": staying}
+    count = int(sys.argv[2])
+    plan = fiducial_plan(count, dark_every=16)
+    kinds = {
+        "rows": lambda: by_rows(plan), "stays": lambda: staying(plan),
+        "pictures": lambda: picture_plan(count), "scene": lambda: scene_plan(count)
+    }  # fmt: skip
     for kind in kinds.keys() & set(sys.argv):
-        plan = kinds[kind](plan)
+        plan = kinds[kind]()
     with World(pause=0.004).rig() as rig:
         done = acquire(plan, rig, sys.argv[1])
     assert not xla_bridge.backends_are_initialized()  # the rig leaves the GPU to others

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from thincam_jax import waveguide as wg
 from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.pictures import Reconstructed
+from thincam_jax.studies.rig import ShownPictures
 from thincam_jax.studies.screen import ScreenResult, ScreenStudy
 from thincam_jax.studies.screen_calibration import CalibrationResult
 from thincam_jax.units import nm
@@ -134,20 +134,21 @@ def draw_models(result: ScreenResult) -> Figure:
     return _sheet(result.study.targets, columns)
 
 
-def draw_pictures(
-    targets: Mapping[str, np.ndarray],
-    captures: Float[np.ndarray, "picture y x"],
-    found: Mapping[str, Reconstructed],
-) -> Figure:
-    """Pictures shown, their captures in grey, turned upright, and reconstructions by solver."""
-    bright = np.quantile(captures, 0.999)
+def draw_pictures(found: ShownPictures) -> Figure:
+    """Pictures shown, their captures in grey, turned upright, and reconstructions by solver.
+
+    What is not known stays white.
+    """
+    captures, bright = found.captures, np.quantile(found.captures, 0.999)
     columns = [("capture, turned", list(captures[:, ::-1, ::-1] / bright), [""] * len(captures))]
-    columns += [(name, list(one.images), _labels(one)) for name, one in found.items()]
-    return _sheet(targets, columns)
+    columns += [(name, list(one.images), _labels(one)) for name, one in found.methods.items()]
+    shown = {n: np.ones((1, 1)) if one is None else one for n, one in found.targets.items()}
+    return _sheet(shown, columns)
 
 
 def _labels(found: Reconstructed) -> list[str]:
-    return [_decibels(score.psnr_db) for score in found.scores.targets.values()]
+    scores = [_decibels(score.psnr_db) for score in found.scores.targets.values()]
+    return scores or [""] * len(found.images)
 
 
 def _decibels(score: float | None) -> str:

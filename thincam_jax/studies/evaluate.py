@@ -150,11 +150,11 @@ def reconstructor(
     return even
 
 
-def _solver(
+def cameras_of(
     study: Study, method: Method, shape: tuple[int, int], object_distance: float
-) -> Reconstructor:
-    """With the PSF of the axis everywhere."""
-    cameras = Cameras(
+) -> Cameras:
+    """Those of a method's exposures."""
+    return Cameras(
         [study.camera(exposure) for exposure in method.exposures],
         wavelength=[exposure.wavelength for exposure in method.exposures],
         object_distance=object_distance,
@@ -162,6 +162,13 @@ def _solver(
         model=study.model,
         pixel_integration=study.pixel_integration,
     )
+
+
+def _solver(
+    study: Study, method: Method, shape: tuple[int, int], object_distance: float
+) -> Reconstructor:
+    """With the PSF of the axis everywhere."""
+    cameras = cameras_of(study, method, shape, object_distance)
     if isinstance(method.solver, FringeScanning):
         scanning = method.solver.prepare(cameras)
         return lambda captures, variances: scanning(captures)

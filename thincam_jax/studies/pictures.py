@@ -61,24 +61,29 @@ class Reconstructed:
 
 
 def reconstructed(
-    targets: Mapping[str, np.ndarray],
+    targets: Mapping[str, np.ndarray | None],
     solver: AbstractSolver,
     system: AbstractOperator,
     captures: ScreenCaptures,
 ) -> Reconstructed:
-    """Reconstruct targets from captures by a matrix, and score them."""
+    """Reconstruct targets from captures by a matrix, and score those that are known."""
     began = time.perf_counter()
     found = reconstruct_targets(system, solver, captures)
     images = np.asarray(found.image, float)
     images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
     seconds = time.perf_counter() - began
-    pairs = list(zip(images, targets.values(), strict=True))
-    scores = [psnr(image, truth) for image, truth in pairs]
+    pairs = [
+        (name, image, truth)
+        for (name, truth), image in zip(targets.items(), images, strict=True)
+        if truth is not None
+    ]
+    scores = [psnr(image, truth) for _, image, truth in pairs]
     of_targets = {
         name: TargetScores(rounded(score), round(ssim(image, truth), 4))
-        for name, score, (image, truth) in zip(targets, scores, pairs, strict=True)
+        for score, (name, image, truth) in zip(scores, pairs, strict=True)
     }
-    means = rounded(float(np.mean(scores))), round(seconds / len(images), 3)
+    mean = rounded(float(np.mean(scores))) if scores else None
+    means = mean, round(seconds / len(images), 3)
     return Reconstructed(images, MethodScores(*means, found.status, found.iterations, of_targets))
 
 

@@ -23,9 +23,23 @@ from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix, Sparse
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import calibration
-from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Wiener
+from thincam_jax.reconstruction import (
+    AbstractSolver,
+    AdmmTV,
+    Reconstruction,
+    Recording,
+    Wiener,
+    reconstruct,
+)
 from thincam_jax.reconstruction.noise import estimate_noise
-from thincam_jax.studies.evaluate import Reconstructor, reconstructor, rounded, sample
+from thincam_jax.studies.evaluate import (
+    Reconstructor,
+    cameras_of,
+    coupled,
+    reconstructor,
+    rounded,
+    sample,
+)
 from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
 from thincam_jax.studies.screen_calibration import diagonal_cells
 from thincam_jax.studies.simulate import noise_free
@@ -53,12 +67,18 @@ class CountingCamera:
         return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
 
 
-def frame_solver(study: Study, width: float) -> FrameSolver:
+def frame_solver(
+    study: Study, width: float, variance: Float[np.ndarray, "y x"] | None = None
+) -> FrameSolver:
     """The function that reconstructs frames (capture, y, x) by the first method of a study.
 
-    - `width`: of the square object that the image covers, mm. The noise is estimated from the
-      frames.
+    - `width`: of the square object that the image covers, mm.
+    - `variance`: of each pixel of a frame, infinite where it is not known; AdmmTV takes the mean
+      and leaves those out, of a single frame. Else the noise is estimated from the frames.
     """
+    method = study.methods[0]
+    if variance is not None and isinstance(method.solver, AdmmTV) and len(method.exposures) == 1:
+        return _masked_solver(study, method, width, variance)
     solve = _solver_of(study, width)
 
     def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
@@ -70,8 +90,27 @@ def frame_solver(study: Study, width: float) -> FrameSolver:
 
 def _solver_of(study: Study, width: float) -> Reconstructor:
     method, distance = study.methods[0], study.object_distance
-    side = max(1, round(width * method.distance / distance / study.pitch))
-    return reconstructor(study, method, (side, side), distance)
+    return reconstructor(study, method, _field_shape(study, width), distance)
+
+
+def _field_shape(study: Study, width: float) -> tuple[int, int]:
+    side = max(1, round(width * study.methods[0].distance / study.object_distance / study.pitch))
+    return side, side
+
+
+def _masked_solver(
+    study: Study, method: Method, width: float, variance: Float[np.ndarray, "y x"]
+) -> FrameSolver:
+    """By the pixels that are known, equally: weights of 1/variance make ADMM converge slowly."""
+    cameras = cameras_of(study, method, _field_shape(study, width), study.object_distance)
+    known, solver = np.isfinite(variance), coupled(method.solver, 1)
+    noise = {"noise_variance": float(variance[known].mean()), "valid": known}
+
+    def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
+        captures = jnp.asarray(frames[:, None], jnp.float32)
+        return reconstruct(Recording(captures, cameras, **noise), solver)
+
+    return solved
 
 
 def live_image(study: Study, width: float) -> Callable[[Float[np.ndarray, "y x"]], np.ndarray]:
@@ -302,37 +341,59 @@ def calibrated(path: Path, folder: Path) -> tuple[Any, ReducedMatrix]:
 
 @dataclass(frozen=True, eq=False)
 class ShownPictures:
-    """Pictures on a monitor, by name, and what was captured and reconstructed of them.
+    """Pictures, by name, and what was captured and reconstructed of them; None: not known.
 
     - `captures`: mean frames without the dark one, counts. `methods`: by solver.
     """
 
-    targets: dict[str, Float[np.ndarray, "row column"]]
+    targets: dict[str, Float[np.ndarray, "row column"] | None]
     captures: Float[np.ndarray, "picture y x"]
     methods: dict[str, Reconstructed]
 
 
 def reconstruct_pictures(
-    targets: dict[str, Float[np.ndarray, "row column"]],
+    targets: Mapping[str, Float[np.ndarray, "row column"] | None],
     frames: Float[np.ndarray, "frame y x"],
     known: tuple[Any, ReducedMatrix],
     solvers: Mapping[str, AbstractSolver],
+    variance: Float[np.ndarray, "y x"] | None = None,
 ) -> ShownPictures:
     """Pictures from frames, equally many of each in the order of `targets`, by a calibration.
 
-    - `known`: see `calibrated`. The noise is estimated from the frames.
+    - `known`: see `calibrated`.
+    - `variance`: of each pixel, infinite where it is not known: its mean counts, and without such
+      pixels the matrix is reduced anew. Else the noise is estimated from the frames.
 
     **Errors**: ValueError where the matrix is of other cells or pixels than the frames.
     """
     matrix, reduced = known
-    shape = next(iter(targets.values())).shape
-    if reduced.in_shape != shape:
-        raise ValueError(f"the matrix is of {reduced.in_shape} cells; the pictures have {shape}")
+    shape = reduced.in_shape
+    for one in targets.values():
+        if one is not None and one.shape != shape:
+            raise ValueError(f"the matrix is of {shape} cells; the pictures have {one.shape}")
     captures = frames.reshape(len(targets), -1, *frames.shape[1:]).mean(axis=1)
-    variance = estimate_noise(jnp.asarray(captures[:, None], jnp.float32)) ** 2
-    seen = ScreenCaptures(reduced.project(matrix, captures), variance[:, 0])
+    if variance is None:
+        noise = estimate_noise(jnp.asarray(captures[:, None], jnp.float32))[:, 0] ** 2
+    else:
+        lit = np.isfinite(variance)
+        noise = jnp.full(len(captures), variance[lit].mean(), jnp.float32)
+        if not lit.all() and lit.size == matrix.shape[0]:  # others are refused below
+            matrix, captures = _KnownRows(matrix, lit.ravel()), np.where(lit, captures, 0)
+            reduced = ReducedMatrix.of(matrix, shape)
+    seen = ScreenCaptures(reduced.project(matrix, captures), noise)
     found = {n: reconstructed(targets, solver, reduced, seen) for n, solver in solvers.items()}
-    return ShownPictures(targets, captures, found)
+    return ShownPictures(dict(targets), captures, found)
+
+
+class _KnownRows:
+    """A matrix, unread, whose rows of pixels that are not known are 0 as they are read."""
+
+    def __init__(self, rows: Any, known: Bool[np.ndarray, " pixel"]):
+        self.rows, self.known, self.shape = rows, known, rows.shape
+        self.chunks = getattr(rows, "chunks", None)
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return np.where(self.known[part, None], self.rows[part], 0)
 
 
 def _exact_matrix(

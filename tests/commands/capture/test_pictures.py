@@ -85,12 +85,40 @@ def test_a_changed_picture_is_another_plan(home):
     [
         ("matrix=null", "matrix: a plan of kind pictures needs it"),
         ("targets=[]", "targets: a plan of kind pictures needs them"),
+        ("plan={kind: scene}", "targets: a plan of kind scene has one; drop the others"),
         ("plan.kind=hadamard", "plan.frames: a plan of kind hadamard takes cells, order, display"),
         ("virtual.screen.object.cells=[8, 8]", "virtual.screen.object.cells: the plan shows"),
     ],
 )
 def test_files_that_do_not_fit(home, asked, line):
     assert line in one_line(call("capture", "pictures.yaml", "--out", "x.zarr", "--set", asked))
+
+
+@pytest.mark.thorough
+def test_a_scene_comes_back_by_the_matrix(home):
+    """Two exposures merged, weighed by their variance; a real one has nothing to compare with."""
+    plan = {"kind": "scene", "exposures": ["10 ms", "40 ms"], "frames": 3, "dark_frames": 2}
+    raw = PICTURES | {"name": "tiny-scene", "plan": plan, "targets": PICTURES["targets"][:1]}
+    (home / "scene.yaml").write_text(yaml.safe_dump(raw), "utf-8")
+    for args in (("capture", "scene.yaml", "--out", "scene.zarr"), ("run", "scene.zarr")):
+        result = call(*args, *(("--out", "seen") if args[0] == "run" else ()))
+        assert result.exit_code == 0, result.output
+    metrics = json.loads((home / "seen/metrics.json").read_text("utf-8"))["methods"]
+    assert all(metrics[name]["targets"]["bars"]["psnr_db"] > 35 for name in ("CGM", "TV"))
+    assert "reconstructs 1 picture at" in assert_says_its_result(home / "seen")
+    shutil.copytree(home / "scene.zarr", home / "real.zarr")
+    text = (home / "scene.zarr/config.yaml").read_text("utf-8")
+    real = text.replace("rig: virtual", "rig: real").replace("sdl", "shutter")
+    (home / "real.zarr/config.yaml").write_text(real, "utf-8")
+    result = call("run", "real.zarr", "--out", "real")
+    assert result.exit_code == 0, result.output
+    scores = json.loads((home / "real/metrics.json").read_text("utf-8"))["methods"]["TV"]
+    assert scores["mean_psnr_db"] is None and not scores["targets"]
+    images = [
+        skimage.io.imread(home / path)
+        for path in ("seen/images/bars--tv.png", "real/images/scene--tv.png")
+    ]
+    np.testing.assert_array_equal(*images)
 
 
 @pytest.mark.thorough

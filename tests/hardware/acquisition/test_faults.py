@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from hardware.acquisition.fault_campaign import STOPS, campaign, require_right
-from hardware.memory_rig import World, by_rows, fiducial_plan, staying
+from hardware.memory_rig import World, by_rows, fiducial_plan, picture_plan, scene_plan, staying
 
 from helpers import ROOT, quick
 from thincam_jax.hardware.acquisition.acquire import acquire
@@ -29,6 +29,16 @@ def test_a_fault_is_recovered_from_or_stops_the_run(fault, times, tmp_path):
     assert (row.injected, row.recovered, row.stopped) == (times, *expected)
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["pictures", "scene"])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_of_pictures_and_of_bracketed_scenes_too(fault, kind, tmp_path):
+    """With repeats, dark frames, and for the scene an exposure that is found."""
+    row = campaign(fault, 6, tmp_path, kind)
+    expected = (0, 6) if fault in STOPS else (6, 0)
+    assert (row.injected, row.recovered, row.stopped) == (6, *expected)
+
+
 def frames_in(store):
     journal = store / "journal.jsonl"
     return journal.read_bytes().count(b'"step":') if journal.exists() else 0
@@ -40,13 +50,19 @@ def frames_in(store):
         (2, 40, ""),
         pytest.param(20, 500, "", marks=pytest.mark.thorough),
         pytest.param(10, 512, "rows", marks=pytest.mark.thorough),
+        pytest.param(6, 240, "pictures", marks=pytest.mark.thorough),
+        pytest.param(6, 240, "scene", marks=pytest.mark.thorough),
     ],
 )
 def test_a_killed_run_is_resumed(kills, count, kept, tmp_path):
     """A kill at the start may find no store, one while it runs finds frames half written."""
     store, random = tmp_path / "store", np.random.default_rng(4)
     plan = fiducial_plan(count, dark_every=16)
-    plan = by_rows(plan) if kept else plan
+    kinds = {
+        "rows": lambda: by_rows(plan), "pictures": lambda: picture_plan(count),
+        "scene": lambda: scene_plan(count)
+    }  # fmt: skip
+    plan = kinds[kept]() if kept else plan
     for kill in range(kills):
         before = frames_in(store)
         process = subprocess.Popen(

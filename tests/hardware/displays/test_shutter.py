@@ -1,6 +1,8 @@
 """A camera that is covered by hand for its dark frames."""
 
 import io
+import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ def rig(monkeypatch):
 
     def cover(text):
         asked.append(text.partition(",")[0])
-        world.shown = np.zeros(world.shape, np.uint8) if "uncover" not in text else world.shown
+        world.shown = np.full(world.shape, "uncover" in text, np.uint8)
 
     monkeypatch.setattr("builtins.input", cover)
     render = lambda pattern: pattern_levels(pattern, (1, 1), 0.0)  # noqa: E731
@@ -42,6 +44,20 @@ def test_it_is_asked_for_once(rig, tmp_path):
     assert frame.shape == (1, *taken.sensor_shape) and np.isfinite(variance).all()
     ratio = taken.settings[1].exposure / taken.settings[0].exposure
     assert ratio == pytest.approx(5, rel=1e-2)
+
+
+def test_a_resumed_run_does_not_take_the_camera_for_open(rig, tmp_path):
+    """It was covered for dark frames when the run before, whose last frames are lost, ended."""
+    plan = scene(WHITE, SETTINGS, frames=3, dark_frames=2)
+    stop = lambda now: now.done == 4 and signal.raise_signal(signal.SIGTERM)  # noqa: E731
+    store = tmp_path / "a.zarr"
+    assert not acquire(plan, rig[0], store, progress=stop).complete
+    shutil.rmtree(store / "frames" / "c" / "2")
+    rig[0].reopen("display")  # as in another process
+    assert acquire(plan, rig[0], store).complete
+    assert rig[1] == ["cover the camera", "uncover the camera", "cover the camera"]
+    taken = read_acquisition(store)
+    np.testing.assert_array_equal(taken.frame(2), taken.frame(0))
 
 
 def test_nobody_answers(monkeypatch):

@@ -218,7 +218,7 @@ def _shown(render: Callable[["Pattern"], Any], pattern: "Pattern") -> Any:
 
 def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     """The state and the optics that the virtual devices of a file share."""
-    from thincam_jax.commands.capture.run import build_study, screen_system
+    from thincam_jax.commands.capture.run import build_study, picture_levels, screen_system
     from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
     from thincam_jax.imaging.scene import Scene
@@ -227,7 +227,8 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     virtual, display, optics = config.virtual, config.display, config.optics
     assert virtual is not None  # checked with the file
     if optics is None:
-        seen = MonitorOptics(screen_system(config), virtual.electrons)
+        before = picture_levels(config).popitem()[1] if config.plan.kind == "scene" else None
+        seen = MonitorOptics(screen_system(config), virtual.electrons, before)
     else:
         plane = build_study(config, virtual.sensor).targets[0].plane
         scene, sensor = Scene(plane, optics.wavelength), Sensor(virtual.sensor, config.camera.pitch)

@@ -101,10 +101,10 @@ class CaptureConfig(ExperimentConfig):
     """Captures of a rig, `rig: real`, or of a simulated one, `rig: virtual`.
 
     - `display`: a scene needs none; someone covers the camera for dark frames.
-    - `targets`: what stands at the object's distance of a virtual rig, one; or the pictures of a
-      plan of kind pictures, on its cells.
-    - `matrix`: with which such pictures are reconstructed: matrix.zarr of a calibration's run, or
-      the store of its captures; by `methods`.
+    - `targets`: what stands at the object's distance of a virtual rig, or on its screen's cells,
+      one; or the pictures of a plan of kind pictures, on its cells.
+    - `matrix`: with which such pictures, or a scene, are reconstructed: matrix.zarr of a
+      calibration's run, or the store of its captures; by `methods`.
     """
 
     kind: Literal["capture"]
@@ -124,7 +124,7 @@ class CaptureConfig(ExperimentConfig):
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
-        kind = self.plan.kind
+        kind, by_cells, optics = self.plan.kind, self.by_cells, self.optics is not None
         if kind in ("method_a", "psf_stack") and self.stage is None:
             raise FieldError(f"a plan of kind {kind} moves a stage; give one", "stage")
         simulated = self.rig == "virtual"
@@ -132,27 +132,39 @@ class CaptureConfig(ExperimentConfig):
             raise FieldError(
                 f"a plan of kind {kind} is shown on pixels; give it", "display", "pitch"
             )
-        if self.optics is not None and self.plan.width is None and kind not in MONITOR:
+        if optics and self.plan.width is None and not by_cells:
             raise FieldError("optics need betas and width of the mask; give them", "plan", "width")
-        if (kind in MONITOR) == (self.optics is not None) and (kind not in ANYTHING or simulated):
-            verb = "takes no" if kind in MONITOR else "needs"
+        if by_cells == optics and (by_cells or simulated or kind not in ANYTHING):
+            verb = "takes no" if by_cells else "needs"
             raise FieldError(f"a plan of kind {kind} {verb} optics", "optics")
         if kind == "grey_levels" and self.display.options.get("grey_levels"):
             raise FieldError("this plan measures it; drop it", "display", "options", "grey_levels")
         check_names(self, "methods", "targets")
-        if (kind == "pictures") != (self.matrix is not None):
+        if (kind == "pictures") != (self.matrix is not None) and kind != "scene":
             verb = "needs it" if kind == "pictures" else "takes none; drop it"
             raise FieldError(f"a plan of kind {kind} {verb}", "matrix")
-        if kind == "pictures":
-            for key in ("targets", "methods"):
+        if self.matrix is not None:
+            for key in ("targets", "methods") if kind == "pictures" else ("methods",):
                 if not getattr(self, key):
-                    raise FieldError("a plan of kind pictures needs them; give one", key)
-        elif self.methods or len(self.targets) > 1:
-            key = "methods" if self.methods else "targets"
-            raise FieldError(f"a plan of kind {kind} has one picture and 'reconstruction'", key)
+                    raise FieldError(f"a plan of kind {kind} needs them; give one", key)
+        elif self.methods:
+            raise FieldError(f"a plan of kind {kind} has 'reconstruction'; drop them", "methods")
+        if kind != "pictures" and len(self.targets) > 1:
+            raise FieldError(f"a plan of kind {kind} has one; drop the others", "targets")
         if simulated:
             self._check_virtual()
         return self
+
+    @property
+    def by_cells(self) -> bool:
+        """Whether the camera is one of cells, with a matrix."""
+        return self.plan.kind in MONITOR or self.matrix is not None
+
+    @property
+    def cells(self) -> tuple[int, int] | None:
+        """Of the plan, or those that a virtual rig's scene stands on."""
+        seen = self.virtual.screen if self.virtual and self.rig == "virtual" else None
+        return self.plan.cells if seen is None else seen.object.cells
 
     @property
     def drivers(self) -> dict[Any, tuple[str, dict[str, Any]]]:
@@ -164,9 +176,9 @@ class CaptureConfig(ExperimentConfig):
         plan, virtual = self.plan, self.virtual
         if virtual is None:
             raise FieldError("rig: virtual needs this section", "virtual")
-        if plan.kind not in MONITOR:
-            if not self.targets:
-                raise FieldError("a virtual rig looks at one; give it", "targets")
+        if plan.kind not in MONITOR and not self.targets:
+            raise FieldError("a virtual rig looks at one; give it", "targets")
+        if not self.by_cells:
             return
         seen, place = virtual.screen, ("virtual", "screen")
         if seen is None:
@@ -174,7 +186,7 @@ class CaptureConfig(ExperimentConfig):
         if seen.hologram.colours is not None:
             message = f"a plan of kind {plan.kind} takes one colour; give wavelength instead"
             raise FieldError(message, *place, "hologram", "colours")
-        if seen.object.cells != plan.cells:
+        if plan.cells not in (None, seen.object.cells):
             raise FieldError(f"the plan shows {plan.cells}; give these", *place, "object", "cells")
         if seen.sensor.shape != virtual.sensor:
             message = f"virtual.sensor is {virtual.sensor}; give this"

@@ -39,11 +39,8 @@ from thincam_jax.studies.rig import (
 from thincam_jax.studies.study import Method, Study, Synthesis, Target
 
 _MATRIX = (
-    "The matrix is in matrix.zarr; a capture of another picture, less the dark frame, is "
-    "reconstructed with it by "
-    '`tc.reconstruct(tc.Recording(capture, read_matrix("matrix.zarr")), tc.AdmmTV())`, '
-    "read_matrix from thincam_jax.measured.calibration. For many captures, its reduced form is in "
-    "reduced.npz, read by `ReducedMatrix.load`."
+    "The matrix is in matrix.zarr, to be given as `matrix` of a file that captures pictures or a "
+    "scene; in Python it is read by `thincam_jax.measured.calibration.read_matrix`."
 )
 
 
@@ -95,7 +92,7 @@ class _CaptureRun(Run):
             self.add("system matrix", self.recover)
         elif config.plan.kind == "grey_levels":
             self.add("grey levels", self.linearise)
-        elif config.plan.kind == "pictures":
+        elif config.matrix is not None:
             self.add("images", self.look)
         elif config.plan.kind != "psf_stack" and config.optics is not None:
             self.add("image", self.reconstruct)
@@ -124,7 +121,7 @@ class _CaptureRun(Run):
     def reconstruct(self) -> None:
         seen, config = self.taken.seen, self.config
         study = build_study(config, (seen.frames.shape[1], seen.frames.shape[2]))
-        solve = frame_solver(study, study.config.object.width)
+        solve = frame_solver(study, study.config.object.width, seen.variance)
         captured = solve(seen.frames)
         images, scores = {"captured": np.squeeze(np.asarray(captured.image, float))}, {}
         if seen.camera is not None and config.virtual is not None:
@@ -140,23 +137,24 @@ class _CaptureRun(Run):
         self.metrics["object_pixel_mm"] = pitch
 
     def look(self) -> None:
-        """The pictures, by the matrix of a calibration."""
-        config, taken = self.config, self.taken
+        """The pictures or the scene, by the matrix of a calibration."""
+        config, seen = self.config, self.taken.seen
         try:
             known = calibrated(Path(config.matrix or ""), self.folder.path)
             solvers = {method.name: build_solver_of(method) for method in config.methods}
             shown = {name: levels / 255 for name, levels in picture_levels(config).items()}
-            found = reconstruct_pictures(shown, taken.seen.frames, known, solvers)
+            asked = shown or {"scene": None}
+            found = reconstruct_pictures(asked, seen.frames, known, solvers, seen.variance)
         except ValueError as error:
             raise ConfigError(f"{config.place_of('matrix')}matrix: {error}") from None
-        drawn = draw_pictures(found.targets, found.captures, found.methods)
-        self.folder.save_figure("images", drawn)
+        self.folder.save_figure("images", draw_pictures(found))
         for name, one in found.methods.items():
             for target, image in zip(found.targets, one.images, strict=True):
                 self.folder.save_image(f"{slug(target)}--{slug(name)}", image)
         self.metrics["methods"] = {name: asdict(one.scores) for name, one in found.methods.items()}
-        self.found = finding(found.methods)
-        self.table = beside(found.methods, published_figures(config.targets))
+        if shown:
+            self.found = finding(found.methods)
+            self.table = beside(found.methods, published_figures(config.targets))
 
     def linearise(self) -> None:
         """The table of a display's grey levels, which its option of that name takes."""
@@ -223,15 +221,15 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
 
 
 def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
-    """Of the pictures of a plan, if it shows any, on its cells, uint8, by name.
+    """Of the pictures that a matrix is for, uint8, by name: none of a real rig's scene.
 
     **Errors**: ConfigError for pictures that cannot be read.
     """
-    if config.plan.kind != "pictures":
+    if config.matrix is None or config.cells is None:
         return {}
 
     def levels(one: PictureConfig) -> tuple[str, np.ndarray]:
-        return one.name, np.rint(255 * picture(one, config.plan.cells)).astype(np.uint8)
+        return one.name, np.rint(255 * picture(one, config.cells)).astype(np.uint8)
 
     return dict(config.read_all("targets", levels, "path"))
 

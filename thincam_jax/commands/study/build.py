@@ -48,7 +48,8 @@ def with_targets(config: Any, seen: ObjectConfig, make: Callable[[], Study]) -> 
         wrong.append(str(error))
 
     def read(entry: TargetConfig) -> Target:
-        target = read_target(entry, seen)
+        image = read_picture(entry)
+        target = Target.of_image(entry.name, image, seen.distance, seen.width, entry.kind)
         if study is not None:
             check_target(study, target)
         return target
@@ -90,12 +91,6 @@ def build_optics(
         return built_mask(mask, exposure), sensor.build()
     except (ValueError, TypeError, FileNotFoundError) as error:
         raise ConfigError(f"mask, sensor or model: {error}") from None
-
-
-def read_target(entry: TargetConfig, seen: ObjectConfig) -> Target:
-    """A target where the object of its file stands."""
-    image = read_picture(entry)
-    return Target.of_image(entry.name, image, seen.distance, seen.width, entry.kind)
 
 
 def read_picture(target: TargetConfig) -> np.ndarray:

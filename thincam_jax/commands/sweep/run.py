@@ -68,8 +68,8 @@ class SweepFolder(RunFolder):
                 failures.append(json.loads(read_regular(self._failure(point))))
         found = joined(rows) if rows else None
         for name, content in (
-            ("results.parquet", None if found is None else parquet_bytes(found)),
-            ("results.csv", None if found is None else csv_bytes(found)),
+            ("results.parquet", None if found is None else table_bytes(pq.write_table, found)),
+            ("results.csv", None if found is None else table_bytes(csv.write_csv, found)),
             ("failures.jsonl", "".join(json.dumps(f, ensure_ascii=False) + "\n" for f in failures)),
         ):
             if content:
@@ -87,7 +87,8 @@ class SweepFolder(RunFolder):
 
 def row_bytes(row: dict[str, Any]) -> bytes:
     """One row as a Parquet file, without what helps only with many rows."""
-    return parquet_bytes(
+    return table_bytes(
+        pq.write_table,
         pa.Table.from_pylist([row]),
         write_statistics=False,
         store_schema=False,
@@ -122,17 +123,10 @@ def joined(rows: Sequence[tuple[dict[str, Any], pa.Table]]) -> pa.Table:
     return pa.table(columns)
 
 
-def parquet_bytes(table: pa.Table, **options: Any) -> bytes:
-    """A table as a Parquet file."""
+def table_bytes(write: Callable[..., Any], table: pa.Table, **options: Any) -> bytes:
+    """A table as the file that a function of PyArrow writes."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, **options)
-    return sink.getvalue().to_pybytes()
-
-
-def csv_bytes(table: pa.Table) -> bytes:
-    """A table as comma-separated values with a line of headings."""
-    sink = pa.BufferOutputStream()
-    csv.write_csv(table, sink)
+    write(table, sink, **options)
     return sink.getvalue().to_pybytes()
 
 

@@ -214,6 +214,8 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     for one in settings:
         run.persist(lambda one=one: run.configure(one))
     run.bits = store.attributes["bits"]
+    if isinstance(run.rig.display, Shutter) and any(step.dark for step in run.steps):
+        run.rig.display.forget()
     return settings
 
 

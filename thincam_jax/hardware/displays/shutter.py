@@ -11,7 +11,7 @@ from thincam_jax.hardware.errors import NotFound
 class Shutter(Display):
     """For a camera before which nothing is shown: a black pattern asks to cover it, by hand.
 
-    A pattern is one level. The camera is taken for open at first.
+    A pattern is one level. The camera is taken for open at first, except after `forget`.
     """
 
     shape = (1, 1)
@@ -22,7 +22,11 @@ class Shutter(Display):
         """None."""
 
     def __init__(self, options: Options):
-        self._is_open = True
+        self._is_open: bool | None = True
+
+    def forget(self) -> None:
+        """Ask at the next pattern, whichever it is: an earlier run may have left a cover."""
+        self._is_open = None
 
     def show(self, pattern: np.ndarray) -> None:
         wanted = bool(pattern.any())

@@ -211,10 +211,12 @@ class MonitorOptics:
 
     - `operator`: from the cells, 1 is white, to the sensor.
     - `electrons`: per second for each unit of the operator's output.
+    - `transmission`: levels over 255 of what stands before the cells, which the monitor lights.
     """
 
     operator: AbstractOperator
     electrons: float
+    transmission: UInt8[np.ndarray, "y x"] | None = None
 
     @functools.cached_property
     def _by_rows(self) -> Any:
@@ -231,6 +233,8 @@ class MonitorOptics:
     ) -> Float[np.ndarray, "y x"]:
         rows, columns = self.operator.in_shape
         cells = cells_shown(shown, (rows, columns)).astype(np.float32)
+        if self.transmission is not None:
+            cells *= self.transmission / np.float32(255)
         if self._by_rows is not None:
             image = (self._by_rows @ cells.ravel()).reshape(self.sensor_shape)
         else:
