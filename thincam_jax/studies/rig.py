@@ -101,7 +101,7 @@ def _field_shape(study: Study, width: float) -> tuple[int, int]:
 def _masked_solver(
     study: Study, method: Method, width: float, variance: Float[np.ndarray, "y x"]
 ) -> FrameSolver:
-    """By the pixels that are known, equally: weights of 1/variance make ADMM converge slowly."""
+    """By the pixels that are known, equally: with weights of 1/variance images were worse."""
     cameras = cameras_of(study, method, _field_shape(study, width), study.object_distance)
     known, solver = np.isfinite(variance), coupled(method.solver, 1)
     noise = {"noise_variance": float(variance[known].mean()), "valid": known}
