@@ -2,9 +2,6 @@
 PYTHON ?= python3
 ARGS ?=
 
-# Extras beside one; `make test-lowest` does without, for their own lower bounds.
-BESIDE_test := ,ome
-
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
@@ -73,5 +70,5 @@ clean: ## Remove build outputs and caches; .venv and runs/ stay.
 
 .venv/.installed-%: pyproject.toml requirements.lock | .venv/.made
 	@echo 'Installing thincam_jax[$*]'
-	@$(PIP) -c requirements.lock -e '.[$*$(BESIDE_$*)]'
+	@$(PIP) -c requirements.lock -e '.[$*]'
 	@touch $@
