@@ -89,6 +89,7 @@ def test_predictions_hold_for_other_masks(kind):
     assert set(choice) <= {0, 1, 2}
 
 
+@pytest.mark.thorough
 def test_lenses_over_the_field():
     """A spot far along an axis, where the PSF is exact; the axis' PSF alone cannot serve."""
     mask = tc.LensletArray(3.0, 0.4, (2, 2))
