@@ -269,4 +269,4 @@ np.testing.assert_allclose(true["separable"], 1e-5, rtol=0.3)
 np.testing.assert_allclose([saved[1e-2], saved[1e-3]], quoted_saved, rtol=0.03)
 if SIZE == "full":
     np.testing.assert_allclose([missed[2], missed[4]], [3e-3, 1e-4], rtol=0.1)
-    assert plans[3e-2].model == "geometric"
+    assert plans[3e-2].method.model == "geometric"
