@@ -47,7 +47,7 @@ def test_the_detail_of_a_chart_holds_its_fine_groups():
 
 
 def test_panels_of_transfer_functions_end_past_their_limits_and_go_to_1():
-    """No panel is half empty, and a title says what of a curve is above it."""
+    """Each panel ends just past its limits; its title gives the largest value above 1."""
     study = tiny.study()
     limits = Limits(None, None, 9.0, 3.7)
     found = {
