@@ -48,7 +48,7 @@ from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommer
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
-from thincam_jax.lensless.propagation.skew import PIXEL_POINTS, focuses_on_a_line, skew_image
+from thincam_jax.lensless.propagation.skew import SKEW_NODES, focuses_on_a_line, skew_image
 from thincam_jax.lensless.sampling import require_phase_sampling
 
 # Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
@@ -177,11 +177,10 @@ def _irradiance(
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
+        nodes = method.nodes if method.pixel_integration else None
         if method.model == "separable" and path.skew:
-            nodes = (method.nodes or PIXEL_POINTS) if method.pixel_integration else None
             return skew_image(mask, grid, path, nodes=nodes)
         if method.model == "separable" and not has_few_terms(mask):
-            nodes = method.nodes if method.pixel_integration else None
             return separable_image(require_factored(mask, "separable"), grid, path, nodes=nodes)
         if method.model == "radial":
             return radial(mask, grid, path, method)
@@ -263,8 +262,9 @@ def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
     averaged = method.pixel_integration and method.nodes is None
-    if method.model == "separable" and averaged and not path.skew:
-        method = replace(method, nodes=pixel_nodes(mask, grid, path, method.float_type))
+    if method.model == "separable" and averaged:
+        nodes = pixel_nodes(mask, grid, path, method.float_type)
+        method = replace(method, nodes=min(nodes, SKEW_NODES) if path.skew else nodes)
     if method.model == "radial" and method.oversampling is None:
         method = replace(method, oversampling=profile_samples(mask, grid, path, method))
     with allow(method.float_type, mask, grid, path):

@@ -212,6 +212,50 @@ def test_angular_spectrum_along_the_ray(mask):
     assert errors[0] < 0.08
 
 
+# --- averages over pixels off both axes -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pitch", "most"),
+    [
+        (11 * um, 1e-4),
+        # Of up to 29 and 72 fringes a pixel.
+        pytest.param(60 * um, 5e-3, marks=pytest.mark.thorough),
+        pytest.param(150 * um, 1.5e-2, marks=pytest.mark.thorough),
+    ],
+)
+def test_averages_are_means_over_points_of_a_pixel(pitch, most):
+    """Of 80 × 80 in each."""
+    tangent = tangents(30, 40)
+    mask = plate(tuple(DISTANCE * tangent))
+    sensor = tc.Sensor((6, 8), pitch)
+    light = {"wavelength": 500 * nm, "at": tangent}
+    found = tc.psf(tc.LenslessCamera(mask, sensor, DISTANCE), pixel_integration=True, **light)
+    fine = tc.LenslessCamera(mask, tc.Sensor((480, 640), pitch / 80), DISTANCE)
+    exact = np.asarray(tc.psf(fine, **light)).reshape(6, 80, 8, 80).mean((1, 3))
+    assert relative(np.asarray(found), exact) < most
+
+
+@pytest.mark.thorough
+def test_averages_have_slopes_and_one_program():
+    """The slope against a difference, of the angle and of β."""
+    weights = np.random.default_rng(0).normal(size=SENSOR.shape)
+
+    def value(at, beta):
+        camera, model = camera_of(beta), tc.PsfMethod(pixel_integration=True, nodes=4)
+        return jnp.sum(weights * tc.psf(camera, wavelength=500 * nm, at=at, model=model))
+
+    counted = count_traces(value)
+    compiled = jax.jit(counted)
+    slopes = jax.jit(jax.grad(value, argnums=(0, 1)))(jnp.array([0.2, 0.3]), 25.0)
+    for k, step in enumerate(((1e-6, 0.0), (0.0, 1e-6))):
+        low, high = (compiled(jnp.array([0.2, 0.3]) + s * jnp.array(step), 25.0) for s in (-1, 1))
+        assert float(slopes[0][k]) == pytest.approx(float(high - low) / 2e-6, rel=1e-4)
+    low, high = (compiled(jnp.array([0.2, 0.3]), 25.0 + s * 1e-5) for s in (-1, 1))
+    assert float(slopes[1]) == pytest.approx(float(high - low) / 2e-5, rel=1e-4)
+    assert counted.traces == 1
+
+
 # --- limits, slopes, precision --------------------------------------------------------------------
 
 

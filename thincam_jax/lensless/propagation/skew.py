@@ -1,27 +1,32 @@
 r"""`separable` of a zone plate lit from a point off both of its axes: chirps cut off by edges."""
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
+from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, zone_orders
+from thincam_jax.lensless.masks.base import AbstractMask, pairs, zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.lattice import pixel_mean
 from thincam_jax.lensless.propagation.path import Path
 
-# Points a pixel for its average: off by some 0.35 over that, where a pixel holds many fringes.
-PIXEL_POINTS = 13
+# Gauss nodes an axis of a pixel's average, at most: 7e-4 of the PSF off where a pixel holds ten
+# fringes of the far edge, 3e-3 where it holds forty.
+SKEW_NODES = 12
 # What the axes may share of an order's curvature, 1 where it focuses along a line.
 _MOST_SHARED = 0.25
-# Of the interpolation across the shear.
-_NODES = 32
+# Of the interpolation across the shear; where a pixel's average leaves little of far edges' waves,
+# those of the first orders need fewer.
+_NODES, _FEW_NODES = 32, 16
+# Numbers of the terms of an image that are held together.
+_AT_ONCE = 2**19
 
 
 def focuses_on_a_line(mask: AbstractMask, path: Path) -> bool:
@@ -67,8 +72,10 @@ def skew_image(
     Exact for a plate without edges and for one edge alone; what is approximated are the waves of
     the four corners: 0.2 % of the PSF at 20° and azimuth 45°, 0.4 % at 30° (β = 25 rad/mm²,
     5.632 mm, d = 6.5 mm). Where an order focuses into a line nearly along an axis the corners
-    count, and the numbers are refused inside jit; outside, `psf` samples them. A pixel's average
-    is the mean over `nodes` points of it, None for its centre.
+    count, and the numbers are refused inside jit; outside, `psf` samples them. Within a pixel the
+    waves are products of the axes' own, since the shear of ξ_k and η_k is some nanometres there:
+    its average, by `nodes` Gauss nodes an axis, None for its centre, is a product for each pair of
+    orders.
     """
     zones = zone_orders(mask)
     ray = path.chief_ray(mask.centre)
@@ -85,69 +92,95 @@ def skew_image(
         "the sensor; use 'angular_spectrum'",
     )
     y, x = path.on_mask(grid, mask.centre)
-    pitch = grid.pitch / path.magnification
-
-    @jax.checkpoint
-    def irradiance(place: Float[Array, "2"]) -> Float[Array, "y x"]:
-        down, across = y + place[0] * pitch, x + place[1] * pitch
-
-        def added(field, order):
-            g, weight = order
-            wave = weight * _order(g, matrix, mask.extent, down, across)
-            return field + wave.astype(field.dtype), None  # the light's own may be wider
-
-        none = jnp.zeros(grid.shape, zones.coefficients.dtype)
-        field, _ = jax.lax.scan(added, none, (curvatures, zones.coefficients))
-        return field.real**2 + field.imag**2
-
-    if nodes is None:
-        return irradiance(jnp.zeros(2, x.dtype))
-    return pixel_mean(irradiance, nodes, jnp.zeros(grid.shape, zones.beta.dtype))
-
-
-def _order(g, matrix, extent, y: Float[Array, " y"], x: Float[Array, " x"]):
-    """U_k of the curvature g = kβ at every pair of y and x."""
-    yy, xx, yx = matrix
+    (yy, xx, yx), (height, width), g = matrix, mask.extent, curvatures
     top, side = g + yy, g + xx
     determinant = top * side - yx**2
-    own_y, own_x, shear = (
-        1 - g * side / determinant,
-        1 - g * top / determinant,
-        g * yx / determinant,
-    )
-    height, width = extent
-    rows = _sheared(determinant / side, height, own_y, shear, y, x)
-    columns = _sheared(determinant / top, width, own_x, shear, x, y).T
-    phases = g * own_y * y[:, None] ** 2 + g * own_x * x**2 + 2 * g * shear * y[:, None] * x
     size = jnp.sqrt((yy * xx - yx**2) * jnp.abs(determinant / (top * side))) / np.pi
-    return as_complex(size) * phasor(phases) * rows * columns
+    coefficients, shear = zones.coefficients * as_complex(size), g * yx / determinant
+    few = _NODES if nodes is None or max(zones.orders) > 1 else _FEW_NODES
+    rows = _Axis(g, determinant / side, 1 - g * side / determinant, shear, height, y, x, few)
+    columns = _Axis(g, determinant / top, 1 - g * top / determinant, shear, width, x, y, few)
+    if nodes is None:
+        middle = jnp.zeros((), y.dtype)
+        waves = coefficients[:, None, None] * rows.waves(middle)
+        return _image(waves, columns.waves(middle), lambda field: field.real**2 + field.imag**2)
+    places, shares = leggauss(nodes)
+    half = grid.pitch / path.magnification / 2
+    offsets = jnp.asarray(places, y.dtype) * half
+    shares = as_complex(jnp.asarray(shares / 2, y.dtype))[:, None, None, None]
+    lower, upper, weights = pairs(coefficients)
+
+    def average(axis: _Axis) -> Complex[Array, "pair n node"]:
+        # One node after another, see `separable`.
+        waves = jax.lax.map(jax.checkpoint(lambda offset: axis.waves(offset)), offsets)
+        return jnp.sum(shares * waves[:, lower] * waves[:, upper].conj(), axis=0)
+
+    return _image(weights[:, None, None] * average(rows), average(columns), jnp.real)
 
 
-def _sheared(
-    alpha: Float[Array, ""],
-    width: Float[Array, ""],
-    own: Float[Array, ""],
-    shear: Float[Array, ""],
-    along: Float[Array, " m"],
-    other: Float[Array, " n"],
-) -> Complex[Array, "m n"]:
-    """∫ e^{jα(ξ − ξ₀)²} dξ over the aperture, ξ₀ = own·along + shear·other.
+class _Axis(eqx.Module):
+    """One axis' factors of the orders' waves, with ξ₀ = own·along + shear·other.
 
-    The shear is some micrometres: it is interpolated in `other` by Chebyshev's polynomials.
+    The shear is some micrometres: they are interpolated in `other` by Chebyshev's polynomials.
     """
-    nodes, weights = _interpolation(len(other))
-    places = other[0] + (other[-1] - other[0]) * jnp.asarray(nodes, other.dtype)
-    values = chirp_integral(
-        jnp.zeros_like(alpha), alpha, own * along[:, None] + shear * places, -width / 2, width / 2
+
+    curvatures: Float[Array, " order"]
+    alpha: Float[Array, " order"]
+    own: Float[Array, " order"]
+    shear: Float[Array, " order"]
+    width: Float[Array, ""]
+    along: Float[Array, " n"]
+    other: Float[Array, " m"]
+    nodes: int = eqx.field(static=True)
+
+    def waves(self, offset: Float[Array, ""]) -> Complex[Array, "order n node"]:
+        """∫ e^{jα(ξ − ξ₀)²} dξ over the aperture, at an offset from each place, with its phase.
+
+        Of the phase that the axes share, each has half in the middle of a pixel.
+        """
+        orders = self.curvatures, self.alpha, self.own, self.shear
+        g, alpha, own, shear = (each[:, None, None] for each in orders)
+        nodes = jnp.asarray(_interpolation(len(self.other), self.nodes)[0], self.other.dtype)
+        sheared = shear * (self.other[0] + (self.other[-1] - self.other[0]) * nodes)
+        place = self.along[:, None] + offset
+        half, origin = self.width / 2, own * place + sheared
+        integral = chirp_integral(jnp.zeros_like(alpha), alpha, origin, -half, half)
+        return integral * phasor(g * (own * place**2 + sheared * (place + offset)))
+
+
+def _image(
+    rows: Complex[Array, "term y node"],
+    columns: Complex[Array, "term x node"],
+    form: Callable[[Complex[Array, " x"]], Float[Array, " x"]],
+) -> Float[Array, "y x"]:
+    """A form of the sum of the products of both axes' factors, some rows of the image at a time."""
+    count, height, nodes = rows.shape
+    width = columns.shape[1]
+    down, across = (
+        jnp.asarray(_interpolation(n, nodes)[1], rows.real.dtype) for n in (height, width)
     )
-    return product(values, as_complex(jnp.asarray(weights, other.dtype)))
+    parts = jnp.concatenate([columns.real, columns.imag]).reshape(-1, nodes).T
+
+    @jax.checkpoint
+    def row(given):
+        factors, place = given
+        real, imaginary = jnp.split(
+            product(jnp.concatenate([factors.real, factors.imag]), across), 2
+        )
+        other = product(place, parts).reshape(2, count, width)
+        return form(
+            jnp.sum(jax.lax.complex(real, imaginary) * jax.lax.complex(other[0], other[1]), 0)
+        )
+
+    at_once = max(1, _AT_ONCE // (count * width))
+    return jax.lax.map(row, (jnp.swapaxes(rows, 0, 1), down.T), batch_size=at_once)
 
 
 @functools.lru_cache
-def _interpolation(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _interpolation(count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Places of the nodes, 0 to 1 from the first sample to the last, and (node, sample) weights."""
-    angles = (np.arange(_NODES) + 0.5) * np.pi / _NODES
+    angles = (np.arange(size) + 0.5) * np.pi / size
     nodes, samples = np.cos(angles), np.linspace(-1, 1, count)
-    orders = np.arange(_NODES)
+    orders = np.arange(size)
     weights = np.cos(np.outer(angles, orders)) @ np.cos(np.outer(orders, np.arccos(samples)))
-    return (nodes + 1) / 2, (2 * weights - 1) / _NODES
+    return (nodes + 1) / 2, (2 * weights - 1) / size
