@@ -249,3 +249,19 @@ def test_poisson_with_cameras_is_upright():
     assert again.history[0].objective == pytest.approx(lowest, rel=1e-3)
     # Most of the lowest one is the noise: half a unit for each of the pixels.
     assert turned.history[0].objective > 1.2 * lowest
+
+
+@pytest.mark.thorough
+def test_poisson_over_the_field_takes_cameras_at_several_distances():
+    """Whose captures, not enlarged, are counts; both together are better than one."""
+    cameras = [rig.camera(), rig.camera(distance=2.5)]
+    own = rig.imaging_model(cameras, model=tc.PsfMethod("geometric", field_tolerance=1.0))
+    seen = jnp.asarray(rig.picture()[::-1, ::-1])
+    light = jnp.stack([operator(seen) for operator in own.field_operators(rig.FIELD)])
+    counts = np.random.default_rng(5).poisson(300.0 / light.mean() * light).astype(float)
+    both = tc.reconstruct(tc.Recording(counts, own), tc.PoissonTV())
+    first = rig.imaging_model(cameras[:1], model=own.model)
+    alone = tc.reconstruct(tc.Recording(counts[:1], first), tc.PoissonTV())
+    assert rig.correlation(both.image, rig.picture()) > 0.97
+    assert float(both.image.min()) >= 0
+    assert rig.correlation(both.image, rig.picture()) > rig.correlation(alone.image, rig.picture())

@@ -168,11 +168,12 @@ class PoissonTV(AbstractIterativeSolver):
     ):
         if callback is not None:
             raise ValueError("method 'poisson' runs in one piece; leave out the callback")
-        if isinstance(recording.imaging_model, Cameras):
-            if max(distance_ratios(recording.imaging_model.cameras)) > 1:
+        model = recording.imaging_model
+        if isinstance(model, Cameras) and not model.over_field:
+            if max(distance_ratios(model.cameras)) > 1:
                 raise ValueError(
                     "method 'poisson' needs all cameras at one distance, since enlarged captures "
-                    "are no counts; use AdmmTV"
+                    "are no counts; use AdmmTV, or a model with a field_tolerance"
                 )
         # The variance is that of the counts, and need not be estimated.
         counted = recording.with_noise(1.0)
