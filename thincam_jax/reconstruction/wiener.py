@@ -63,9 +63,8 @@ class WienerSynthesis(eqx.Module):
     captures, the steps at the sensor's borders are counted as noise (`crop_noise`); a
     single capture therefore loses its lowest frequencies, which synthesised ones do not.
 
-    With a `field_tolerance` the image is divided by the light of every point. A filter of its own
-    for each of 3×3 or 5×5 parts of the field, each with its PSF, gains nothing beyond (±14° and
-    ±24°, β = 12 and 20 rad/mm², 30 and 40 dB: within 0.03 dB).
+    With a `field_tolerance` the image is divided by the light of every point; the PSF stays that of
+    the axis.
 
     Differentiable in all numbers of the cameras but the distances, which set array sizes.
 
