@@ -12,7 +12,7 @@ from reconstruction import extremes, rig, scenes
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2
-from thincam_jax.imaging.operators import Matrix, Separable
+from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
 from thincam_jax.imaging.targets.images import resize, sample_image
 from thincam_jax.reconstruction import ridge as module
 from thincam_jax.reconstruction.normal_equations import IterativeNormal, normal_equations
@@ -315,6 +315,24 @@ def test_the_modes_of_all_terms_precondition_conjugate_gradients():
         quick, slow = (n.solution(right, start, 1e-8, 500) for n in (normal, plain))
         assert relative_l2(normal.applied(quick.value), right) < 1e-6
         assert 3 * int(quick.stats["num_steps"]) < int(slow.stats["num_steps"])
+
+
+def test_planes_are_preconditioned_together():
+    """Two planes behind one capture; each by itself takes more than 500 steps."""
+    y, x = np.indices((65, 73)) - np.array([32, 36])[:, None, None]
+    zones = [
+        (1 + np.cos(beta * (y**2 + x**2))) * (np.maximum(abs(y), abs(x)) < 9)
+        for beta in (0.12, 0.2)
+    ]
+    kernels = jnp.asarray(np.stack(zones)[None] / 30)
+    camera = CropConvolution(kernels, 1.0, (38, 42), (28, 32), summed=1)
+    problem = InverseProblem([camera], [jnp.zeros((1, 38, 42))])
+    normal = normal_equations(problem, jnp.asarray(1e-2))
+    right = jnp.asarray(np.random.default_rng(4).normal(size=(1, 2, 28, 32)))
+    assert isinstance(normal, IterativeNormal)
+    found = normal.solution(right, jnp.zeros_like(right), 1e-8, 500)
+    assert relative_l2(normal.applied(found.value), right) < 1e-6
+    assert int(found.stats["num_steps"]) < 200
 
 
 @pytest.mark.parametrize("rule", quick(["gcv", "sure", "likelihood"], 0))

@@ -12,6 +12,7 @@ Factorisations are not differentiated: derivatives follow from the equation itse
 import abc
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,11 +21,18 @@ import jax
 import jax.numpy as jnp
 import lineax
 import optimistix
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
-from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatrix, Scaled, Separable
+from thincam_jax._core.precision import as_complex, product
+from thincam_jax.imaging.operators import (
+    AbstractOperator,
+    CropConvolution,
+    Matrix,
+    ReducedMatrix,
+    Scaled,
+    Separable,
+)
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.imaging.operators.separable import SeparableModes
@@ -212,7 +220,7 @@ class IterativeNormal(AbstractNormal):
         options: dict[str, Any] = {"y0": guess / factor}
         operators, filtered = convolutions(self.problem), None
         if operators is not None:
-            filtered = functools.partial(self._uncropped, operators)
+            filtered = functools.partial(_uncropped, operators[0], self._inverse(operators))
         elif self.modes is not None:
             filtered = functools.partial(_by_modes, self.modes, self.shift)
         if filtered is not None:
@@ -223,21 +231,30 @@ class IterativeNormal(AbstractNormal):
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
-    def _uncropped(self, operators, image):
-        """(Σ w̄|Ĥ|² + μ)⁻¹ on the window, and cut: the inverse without the crop.
-
-        Positive definite, since it is a positive filter between a map and its transpose.
-        """
-        operator = operators[0]
-        power = sum(
-            jnp.mean(w) * (o.spectrum.real**2 + o.spectrum.imag**2)
+    def _inverse(self, operators: Sequence[CropConvolution]) -> Complex[Array, "channel p q v u"]:
+        """(Σ w̄ ĥ_p* ĥ_q + μ)⁻¹ of the planes p, q at each frequency."""
+        parts = [
+            as_complex(jnp.mean(w)) * o.spectrum[:, :, None].conj() * o.spectrum[:, None]
             for o, w in zip(operators, self.problem.weights, strict=True)
-        )
-        field = place(image, operator.field_corner, operator.window)
-        filtered = jnp.fft.rfft2(field)
-        filtered = filtered / (power + self.shift).astype(filtered.dtype)
-        field = jnp.fft.irfft2(filtered, s=operator.window)
-        return cut(field, operator.field_corner, operator.field_shape)
+        ]
+        matrix = sum(parts[1:], start=parts[0])
+        count, shift = matrix.shape[1], self.shift.astype(matrix.dtype)
+        if count == 1:
+            return 1 / (matrix + shift)
+        matrix = jnp.moveaxis(matrix, (1, 2), (-2, -1))
+        inverse = jnp.linalg.inv(matrix + shift * jnp.eye(count, dtype=matrix.dtype))
+        return jnp.moveaxis(inverse, (-2, -1), (1, 2))
+
+
+def _uncropped(operator: CropConvolution, inverse, image: Float[Array, "..."]):
+    """The inverse on the window, and cut: the inverse without the crop.
+
+    Positive definite, since it is a positive filter between a map and its transpose.
+    """
+    field = jnp.fft.rfft2(place(image, operator.field_corner, operator.window))
+    filtered = jnp.sum(inverse * field[..., None, :, :, :], axis=-3)
+    field = jnp.fft.irfft2(filtered, s=operator.window)
+    return cut(field, operator.field_corner, operator.field_shape)
 
 
 def _weighted(problem: InverseProblem):
