@@ -12,6 +12,7 @@ s/2. σ/s is one number for a camera and its noise, found from C. s falls until 
 pixels of z, the diagonal of :math:`M^{-1}`, comes near s²: then most of z is the denoiser's.
 """
 
+import dataclasses
 import math
 import os
 import time
@@ -26,7 +27,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
-from thincam_jax.reconstruction.methods import starts_uniform
+from thincam_jax.reconstruction.methods import AdmmTV, starts_uniform
 from thincam_jax.reconstruction.normal_equations import (
     INNER_STEPS,
     AbstractNormal,
@@ -55,17 +56,20 @@ from thincam_jax.reconstruction.solver import (
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# s falls from twice the brightness of the image to a sixth of that; given a start, from a third.
+# s falls from twice the brightness of the image to a sixth of that; given a start, from a twelfth.
 # From once the brightness dark images at 20 dB stay 1.5 dB below; from three times 40 dB lose 0.2.
-_FIRST, _LAST, _WARM = 2, 1 / 6, 1 / 3
+_FIRST, _LAST, _WARM = 2, 1 / 6, 1 / 12
 # Where the deviation of z is then below that part of s, s is halved up to four times more. It gains
-# a FlatCam 1.5 to 2.5 dB, a MURA at 40 dB 0.2; without that condition all others lose decibels.
-_KNOWN, _HALVINGS = 0.93, 4
+# a FlatCam 1.5 to 2.5 dB, a MURA up to 0.5; a dark room loses 0.8 dB without that condition.
+_KNOWN, _HALVINGS = 0.96, 4
 # Factor that was best or close to it for two masks at 20 to 40 dB.
 _MARGIN = 1.1
-# Part of the last change by which a data step goes ahead, where unknowns outnumber pixels: what the
-# sensor hardly sees converges slowly. It gains 0.4 to 1.3 dB there, and loses 0.1 to 0.2 elsewhere.
-_MOMENTUM = 0.5
+# Weight and iterations of the image by total variation from which several planes begin, and fields
+# with more pixels than the captures: what captures hardly show takes too many data steps. It gains
+# planes up to 0.9 dB; a dark room at 40 dB up to 15 dB.
+_TAU, _ITERATIONS = 1.0, 100
+# Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
+_STEP_ERROR = 0.03
 _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
 _LEAST_SHARE = 0.02  # of the pixels, by which the noise can be found
 
@@ -88,8 +92,9 @@ class PlugAndPlay(AbstractIterativeSolver):
 
     Nothing is to be tuned. The noise is taken as the recording tells, corrected by up to four times
     where the residual of the first data step is another. Each image, colour and plane is denoised
-    by itself. What the denoiser has not learned, such as fine texture, may be lost, and what looks
-    like an edge be made up.
+    by itself. Several planes, and fields larger than the captures, begin with an image by `AdmmTV`.
+    What the denoiser has not learned, such as fine texture, may be lost, and what looks like an
+    edge be made up.
 
     **Arguments**
 
@@ -132,10 +137,16 @@ class PlugAndPlay(AbstractIterativeSolver):
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ):
-        """Reconstruct; with a start image s begins at a half of its usual course."""
+        """Reconstruct; with a start image s begins at a twelfth of its usual course."""
         began = time.perf_counter()
         apart = TotalVariation(coupling="none")  # colours
         problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
+        if start is None and _is_slow(problem):
+            options = {"nonnegative": self.nonnegative, "synthesis": self.synthesis}
+            first = AdmmTV(_TAU, iterations=_ITERATIONS, **options).solve(recording)
+            if first.status == "interrupted":
+                return dataclasses.replace(first, method=self.name)
+            start = first.image
         image = None
         if start is not None:
             image = first_image(problem, recording.oriented(start), uniform=True)
@@ -201,9 +212,7 @@ class _Run:
         self.normal = _normal(scaled.problem, jnp.ones_like(self.precision), like)
         self.right = back_projected(scaled.problem, scaled.problem.captures)
         self.result = image
-        self.before = self.image = image / self.unit
-        pixels = sum(math.prod(c.shape[-2:]) for c in problem.captures)
-        self.momentum = _MOMENTUM if math.prod(problem.image_shape[-3:]) > pixels else 0.0
+        self.image = image / self.unit
         level = uniform_image(problem) / self.unit
         seen = brightness(self.image) if warm else jnp.max(level)
         self.first = or_one(_FIRST * seen) * (_WARM if warm else 1)
@@ -223,8 +232,7 @@ class _Run:
             part = (number - 1) / max(solver.iterations - 1, 1)
             s = self.largest * begin * (self.last / begin) ** part
         shift = 1 / (s**2 * self.precision)
-        ahead = self.image + (self.momentum if number > 1 else 0) * (self.image - self.before)
-        found = _data_step(self.normal, self.right, ahead, shift)
+        found = _data_step(self.normal, self.right, self.image, shift, self.precision)
         if not bool(jnp.isfinite(found).all()):
             self.misfit, self.is_done = math.nan, True
             return
@@ -240,7 +248,7 @@ class _Run:
             self._plan(image)
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
-            self.before, self.image, self.result = self.image, image, image * self.unit
+            self.image, self.result = image, image * self.unit
         self.is_done = number > 0 and self.change < solver.tolerance
 
     def _plan(self, image: Image) -> None:
@@ -256,6 +264,12 @@ class _Run:
             self.last /= 2
         if self.last < _LAST:
             self.ratio = jnp.maximum(self.ratio, noise_ratio(self.normal, shift()))
+
+
+def _is_slow(problem: InverseProblem) -> bool:
+    """Whether there are several planes, or more unknowns than pixels."""
+    pixels = sum(math.prod(c.shape[-2:]) for c in problem.captures)
+    return problem.image_shape[-3] > 1 or math.prod(problem.image_shape[-2:]) > pixels
 
 
 def _normal(
@@ -329,9 +343,13 @@ def noise_mistake(
 
 def _probed(normal: AbstractNormal, shift):
     """Random signs v, and (AᵀwA + μ)⁻¹ v."""
-    shape, dtype = normal.problem.image_shape, normal.problem.captures[0].dtype
-    signs = jax.random.rademacher(jax.random.key(0), shape, dtype)
+    signs = _signs(normal)
     return signs, _roughly(normal.shifted(shift), signs)
+
+
+def _signs(normal: AbstractNormal) -> Image:
+    shape, dtype = normal.problem.image_shape, normal.problem.captures[0].dtype
+    return jax.random.rademacher(jax.random.key(0), shape, dtype)
 
 
 def _roughly(normal: AbstractNormal, right: Image) -> Image:
@@ -342,8 +360,17 @@ def _roughly(normal: AbstractNormal, right: Image) -> Image:
 
 
 @eqx.filter_jit
-def _data_step(normal: AbstractNormal, right: Image, image: Image, shift: Float[Array, ""]):
-    return normal.shifted(shift)(right + shift * image, image)
+def _data_step(normal: AbstractNormal, right: Image, image: Image, shift, precision):
+    """z; by conjugate gradients the change from f, up to a part of the noise of Aᵀg."""
+    normal = normal.shifted(shift)
+    if not isinstance(normal, IterativeNormal):
+        return normal.solve(right + shift * image)
+    signs = _signs(normal)
+    noise = jnp.sqrt(jnp.mean(signs * (normal.applied(signs) - shift * signs)) / precision)
+    change = right + shift * image - normal.applied(image)
+    size = or_one(jnp.sqrt(jnp.mean(change**2)))
+    tolerance = jnp.clip(_STEP_ERROR * noise / size, 1e-6, 0.1)
+    return image + normal.solution(change, jnp.zeros_like(image), tolerance, INNER_STEPS).value
 
 
 @jax.jit
