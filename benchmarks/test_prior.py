@@ -1,0 +1,259 @@
+"""One prior for every camera: plug and play beside total variation, the same noise for all.
+
+Photographs of CID22's validation set (CC BY-SA 4.0), which no network here has seen, behind 14
+cameras. `AdmmTV` has the τ that is best for two tuning photographs of the CC0 set; nothing of
+`PlugAndPlay` is tuned. PSNR after the best gain and offset; gains are means over the photographs
+with 95 % intervals by Student's t. CPU times are of calls that were compiled before.
+
+`THINCAM_COUNT` (4) photographs; 24 take some two hours.
+"""
+
+import dataclasses
+import os
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import thincam_jax as tc
+from thincam_jax import waveguide as wg
+from thincam_jax.imaging.metrics import align, psnr
+from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Separable
+from thincam_jax.imaging.targets import resize
+from thincam_jax.learn.refocusing import photographs
+from thincam_jax.units import deg, nm, um
+
+PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
+COUNT = int(os.environ.get("THINCAM_COUNT", "4"))
+SIDE, LIGHT = 128, 500 * nm
+WEIGHTS = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+
+def noisy(capture, snr, rng):
+    """A capture with noise `snr` dB below its variance."""
+    capture = np.asarray(capture, np.float32)
+    deviation = float(capture.std()) * 10 ** (-snr / 20)
+    return capture + np.float32(deviation) * rng.standard_normal(capture.shape, np.float32)
+
+
+def computed(cameras, depth=100.0, synthesis=None):
+    """Cameras whose PSFs are computed; a picture of 128² pixels fills the field."""
+    model = tc.Cameras(cameras, wavelength=LIGHT, object_distance=depth, field_shape=(SIDE, SIDE))
+    blank = tc.Recording(np.zeros((len(cameras), *cameras[0].sensor.shape), np.float32), model)
+    operators = blank.problem(synthesis=None).operators
+
+    def record(picture, snr, seed):
+        rng, turned = np.random.default_rng(seed), jnp.asarray(picture[None, None, ::-1, ::-1])
+        seen = [noisy(o(turned)[0], snr, rng) for o in operators]
+        return dataclasses.replace(blank, captures=[*seen]), picture
+
+    return record
+
+
+def zone_plate(pixels=256, depth=100.0):
+    mask = tc.FresnelZoneAperture(13.0, width=5.6)
+    return computed([tc.LenslessCamera(mask, tc.Sensor((pixels, pixels), 44 * um), 7.5)], depth)
+
+
+def phased(pairs, phases):
+    """Settings (β, d) at several phases each."""
+    sensor = tc.Sensor((256, 256), 22 * um)
+    return computed(
+        [
+            tc.LenslessCamera(tc.FresnelZoneAperture(beta, phase, width=5.632), sensor, d)
+            for beta, d in pairs
+            for phase in phases
+        ],
+        250.0,
+    )
+
+
+def mura(order, cell):
+    mask = tc.ModifiedUniformlyRedundantArray(order, cell)
+    return computed([tc.LenslessCamera(mask, tc.Sensor((256, 256), 22.4 * um), 3.0)])
+
+
+def of_operator(operator, side, dark=0):
+    """An operator, and pictures of `side` pixels within a dark margin."""
+
+    def record(picture, snr, seed):
+        small = resize(picture, side).astype(np.float32)
+        scene = np.pad(small, dark) if dark else small
+        capture = noisy(operator(jnp.asarray(scene)), snr, np.random.default_rng(seed))
+        return tc.Recording(capture, operator), scene
+
+    return record
+
+
+def flatcam():
+    code = np.repeat(2.0 * tc.maximum_length_sequence(127) - 1, 3)
+    code = np.convolve(np.tile(code, 2), [0.25, 0.5, 0.25], "same")
+    sides = [
+        np.stack([code[3 * m : 3 * m + n] for m in range(count)], axis=1) / n**0.5
+        for n, count in ((250, 72), (310, 96))
+    ]
+    left, right = (np.asarray(s, np.float32) for s in sides)
+    return of_operator(Separable(left, right), (72, 96))
+
+
+def measured(kind):
+    """PSFs that were measured, of 96² pixels: the picture lies in a dark field of 191²."""
+    rng = np.random.default_rng(0)
+    if kind == "diffuser":
+        y, x = np.meshgrid(*2 * [np.fft.fftfreq(96)], indexing="ij")
+        relief = np.fft.ifft2(
+            np.fft.fft2(rng.standard_normal((96, 96))) * np.exp(-(400 * (y**2 + x**2)))
+        )
+        slopes = np.gradient(relief.real / relief.real.std())
+        places = [np.indices((96, 96))[k] + 40 * slopes[k] for k in (0, 1)]
+        edges = [np.arange(97) - 0.5] * 2
+        psf = np.histogram2d(places[0].ravel(), places[1].ravel(), edges)[0]
+    else:
+        mask = tc.FresnelZoneAperture(13.0, width=4.2)
+        own = tc.LenslessCamera(mask, tc.Sensor((96, 96), 44 * um), 7.5)
+        psf = np.asarray(tc.psf(own, wavelength=LIGHT, object_distance=100.0))
+    psf = (psf / psf.sum()).astype(np.float32)
+    model = tc.Psfs(psf[None], field_shape=(191, 191))
+    blank = tc.Recording(np.zeros((1, 96, 96), np.float32), model)
+    (operator,) = blank.problem().operators
+
+    def record(picture, snr, seed):
+        small = resize(picture, (64, 64)).astype(np.float32)
+        scene = np.pad(small, ((63, 64), (63, 64)))
+        capture = np.asarray(operator(jnp.asarray(scene)[None, None])[0])
+        return dataclasses.replace(
+            blank, captures=[noisy(capture, snr, np.random.default_rng(seed))]
+        ), scene
+
+    return record
+
+
+def screen():
+    """The see-through screen's matrix with the errors of its calibration."""
+    hologram = wg.VolumeHologram.record(
+        532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
+    )
+    sensor = tc.Sensor((110, 110), 4 * 4.8 * um)
+    places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+    camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5, *places), sensor, 6.0, 10.0)
+    rays = wg.system_operator(camera, wg.ObjectPlane((64, 64), 550.0, 150.0, (0.0, 27.0)))
+    dense = np.zeros((110**2, 64**2), np.float32)
+    np.add.at(dense, (np.asarray(rays.rows), np.asarray(rays.columns)), np.asarray(rays.values))
+    deviation = 1e-3 * dense.max()
+    errors = deviation * np.random.default_rng(1).standard_normal(dense.shape, np.float32)
+    matrix = Matrix(dense + errors, (64, 64), (110, 110))
+    reduced = ReducedMatrix.of(matrix)
+
+    def record(picture, snr, seed):
+        small = resize(picture, (64, 64)).astype(np.float32)
+        clean = (dense @ small.ravel()).reshape(110, 110)
+        capture = noisy(clean, snr, np.random.default_rng(seed))
+        # What is known of both: the noise of the capture and of the calibration.
+        variance = float(clean.var()) * 10 ** (-snr / 10) + deviation**2 * float(np.sum(small**2))
+        seen = reduced.project(matrix, jnp.asarray(capture))
+        return tc.Recording(seen, reduced, noise_variance=variance), small
+
+    return record
+
+
+def planes():
+    """A disc at 60 mm, cut out of one picture, and the same picture behind it at 120 mm."""
+    mask = tc.FresnelZoneAperture(13.0, width=5.6)
+    own = tc.LenslessCamera(mask, tc.Sensor((256, 256), 44 * um), 7.5)
+    model = tc.Cameras(
+        [own], wavelength=LIGHT, object_distance=[60.0, 120.0], field_shape=(SIDE, SIDE)
+    )
+    blank = tc.Recording(np.zeros((1, 256, 256), np.float32), model)
+    (operator,) = blank.problem().operators
+    y, x = np.indices((SIDE, SIDE)) - SIDE / 2
+    disc = (np.hypot(y - 10, x + 12) < 26).astype(np.float32)
+
+    def record(picture, snr, seed):
+        scene = np.stack([picture[:, ::-1] * disc, picture * (1 - disc)])
+        capture = np.asarray(operator(jnp.asarray(scene[None, :, ::-1, ::-1]))[0])
+        return dataclasses.replace(
+            blank, captures=[noisy(capture, snr, np.random.default_rng(seed))]
+        ), scene
+
+    return record
+
+
+ZEROS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
+PAIR = (0.0, 3 * np.pi / 2)
+CASES = {
+    **{f"zone aperture, {t:g} mm": (lambda t=t: zone_plate(depth=t)) for t in (60.0, 100.0, 200.0)},
+    "zone aperture, a quarter of the sensor": lambda: zone_plate(128),
+    "fringe scanning": lambda: phased([(25.0, 6.5)], ZEROS),
+    "method A": lambda: phased([(25.0, 5.0), (25.0, 6.5)], PAIR),
+    "method B": lambda: phased([(25.0, 6.5), (21.0, 6.5)], PAIR),
+    "MURA-31": lambda: mura(31, 0.18),
+    "MURA-101": lambda: mura(101, 0.055),
+    "FlatCam": flatcam,
+    "measured zone aperture": lambda: measured("zones"),
+    "measured diffuser": lambda: measured("diffuser"),
+    "screen": screen,
+    "two planes": planes,
+}
+
+
+def score(result, truth):
+    """PSNR of each plane, after one gain and offset for all of them."""
+    if truth.ndim == 2:
+        return [float(psnr(result.image, truth))]
+    image = np.asarray(align(result.image, truth)[0])
+    return [float(psnr(i, t, aligned=False)) for i, t in zip(image, truth, strict=True)]
+
+
+def timed(recording, method):
+    """The reconstruction, and its CPU seconds."""
+    began = time.process_time()
+    result = tc.reconstruct(recording, method)
+    result.image.block_until_ready()
+    return result, time.process_time() - began
+
+
+def gain(values):
+    """Mean and half of the 95 % interval over photographs, and the least."""
+    spread = np.std(values, ddof=1) / len(values) ** 0.5
+    half = scipy.stats.t.ppf(0.975, len(values) - 1) * spread
+    return f"{np.mean(values):+.2f} ± {half:.2f} (least {np.min(values):+.2f})"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_plug_and_play(name, capsys):
+    if not (PHOTOGRAPHS / "cc-by-sa/validation").is_dir():
+        pytest.skip(f"no photographs in {PHOTOGRAPHS}; set THINCAM_PHOTOGRAPHS")
+    unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images[:COUNT]
+    tuning = photographs(PHOTOGRAPHS / "cc0", SIDE).images[4:12:4]
+    record = CASES[name]()
+    for level in (20.0, 30.0, 40.0):
+
+        def mean(tau, level=level):
+            pairs = [record(picture, level, 99) for picture in tuning]
+            return np.mean(
+                [score(tc.reconstruct(r, tc.AdmmTV(tau, iterations=150)), t) for r, t in pairs]
+            )
+
+        methods = {"TV": tc.AdmmTV(max(WEIGHTS, key=mean), iterations=150), "PnP": tc.PlugAndPlay()}
+        scores, seconds = ({method: [] for method in methods} for _ in range(2))
+        for seed, picture in enumerate(unseen):
+            recording, truth = record(picture, level, seed)
+            for method, solver in methods.items():
+                if seed == 0:
+                    timed(recording, solver)  # compiles
+                result, taken = timed(recording, solver)
+                scores[method].append(score(result, truth))
+                seconds[method].append(taken)
+        tau, tv, pnp = float(methods["TV"].tau), *(np.array(one) for one in scores.values())
+        times = " / ".join(f"{np.median(taken):.2f}" for taken in seconds.values())
+        with capsys.disabled():
+            for plane, (one, other) in enumerate(zip(tv.T, pnp.T, strict=True)):
+                print(
+                    f"{name}, plane {plane} | {level:g} | {one.mean():.2f} (τ {tau:g}) | "
+                    f"{other.mean():.2f} | {gain(other - one)} | {times}",
+                    flush=True,
+                )
+        assert np.mean(pnp - tv, axis=0).min() > -0.1
