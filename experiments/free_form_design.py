@@ -244,9 +244,9 @@ def judged(masks, distances, shares, electrons):
     optics = tc.Cameras(coarse, **source, field_shape=field)
     if len({*distances}) == 1:  # PSFs over the scene's own pixel, too
         grid = kernel_grid(fine.grid, (2 * field[0], 2 * field[1]))
-        h = [tc.psf(c.on_grid(grid), **source, pixel_integration=True) for c in cameras]
+        own = {**source, "pixel_integration": True}
+        h = jnp.stack([tc.psf(c.on_grid(grid), **own) for c in cameras])
         for axis in (1, 2):
-            h = jnp.stack([*h])
             h = (jnp.roll(h, 1, axis) + 2 * h + jnp.roll(h, -1, axis)) / 4
         optics = tc.Psfs(h[:, 1::2, 1::2] * pitch**2, field_shape=field)
     recording = tc.Recording(captures, optics, noise_variance=variances.tolist())
