@@ -32,7 +32,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
-from thincam_jax._core.precision import as_complex
+from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.reconstruction.admm import (
@@ -249,9 +249,8 @@ class NormalInverse(eqx.Module):
     ) -> Complex[Array, "*batch channel plane v u"]:
         smooth = penalties.variation * difference_symbol(self.window, spectrum.real.dtype)
         if self.power is not None:
-            inverse = 1 / (penalties.data * self.power + smooth + penalties.image)
             # By real factors, so that a gradient keeps no complex copy.
-            return jax.lax.complex(spectrum.real * inverse, spectrum.imag * inverse)
+            return scaled(spectrum, 1 / (penalties.data * self.power + smooth + penalties.image))
         planes = spectrum.shape[-3]
         depth = penalties.variation * self._depth_symbol(planes, smooth.dtype)
         inverse = 1 / (smooth + depth[:, None, None] + penalties.image)
@@ -283,10 +282,6 @@ class NormalInverse(eqx.Module):
 
 def _total(parts: list[Array]) -> Array:
     return sum(parts[1:], start=parts[0])
-
-
-def squared_modulus(spectrum: Complex[Array, "..."]) -> Float[Array, "..."]:
-    return spectrum.real**2 + spectrum.imag**2
 
 
 def difference_symbol(window: tuple[int, int], dtype: DTypeLike) -> Float[Array, "v u"]:

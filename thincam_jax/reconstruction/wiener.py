@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
-from thincam_jax._core.precision import as_complex
+from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.lensless.camera import LenslessCamera
@@ -173,9 +173,9 @@ class WienerSynthesis(eqx.Module):
             ]
         )
         density, scene = self._noise_and_scene(spectra, noise, captures[0].size)
-        gain = jnp.sum(jnp.abs(self.spectra) ** 2 / density, axis=0) + 1 / scene
-        merged = jnp.sum(self.spectra.conj() * spectra / density.astype(spectra.dtype), axis=0)
-        full = jnp.fft.irfft2(merged / gain.astype(merged.dtype), s=self.padded)
+        gain = jnp.sum(squared_modulus(self.spectra) / density, axis=0) + 1 / scene
+        merged = jnp.sum(self.spectra.conj() * scaled(spectra, 1 / density), axis=0)
+        full = jnp.fft.irfft2(scaled(merged, 1 / gain), s=self.padded)
         return (crop_field(full, self.field_shape)[::-1, ::-1] + mean) / self.light
 
     def _noise_and_scene(self, spectra, noise, pixels: int):
@@ -183,8 +183,8 @@ class WienerSynthesis(eqx.Module):
         # Enlarging by r keeps the noise's variance and concentrates it in 1/r² of the band.
         squared = jnp.asarray(np.square(self.ratios), dtype=noise.dtype)[:, None, None]
         density = noise[:, None, None] * squared
-        periodogram = jnp.abs(spectra) ** 2 / (squared * pixels)
-        expected = jnp.abs(self.spectra) ** 2 * self.prior
+        periodogram = squared_modulus(spectra) / (squared * pixels)
+        expected = squared_modulus(self.spectra) * self.prior
         inner = inner_band(self.padded, self.sensor_shape)
         # Per captured sample, though the scene may cover fewer: per scene sample the power is
         # higher and the result 0.3 dB worse, because the crop adds noise that is not modelled.
@@ -369,12 +369,8 @@ def crop_noise(
     strength is read off that axis, row by row, and so for the other border.
     """
     v, u = _axis_distance(padded, sensor_shape)
-    on_v = jnp.mean(
-        periodogram, axis=-1, where=np.broadcast_to(u <= 1, periodogram.shape), keepdims=True
-    )
-    on_u = jnp.mean(
-        periodogram, axis=-2, where=np.broadcast_to(v <= 1, periodogram.shape), keepdims=True
-    )
+    on_v = jnp.mean(periodogram[..., u[0] <= 1], axis=-1, keepdims=True)
+    on_u = jnp.mean(periodogram[..., v[:, 0] <= 1, :], axis=-2, keepdims=True)
     across, down = (jnp.asarray(1 / (1 + f**2), dtype=periodogram.dtype) for f in (u, v))
     return on_v * across + on_u * down
 

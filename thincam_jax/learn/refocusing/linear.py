@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
+from thincam_jax._core.precision import squared_modulus
 from thincam_jax.learn.refocusing.planes import Planes
-from thincam_jax.reconstruction.splittings import squared_modulus
 
 
 class LinearStep(eqx.Module):
