@@ -176,7 +176,7 @@ show("against the light shown", decibels(images, truth**2.2))
 show("gain and offset fitted", [list(map(psnr, one, truth)) for one in images])
 
 figure = plt.figure(figsize=(10.5, 8.4), layout="constrained")
-above, below = figure.subfigures(2, 1, height_ratios=(1.1, 1))
+(above,), (below,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.1, 1))
 rows = {"shown": truth, "conjugate\ngradients": found[ALL][0], "ADMM-TV": found[ALL][1]}
 for number, (line, label) in enumerate(zip(above.subplots(3, 6), rows, strict=True)):
     for column, ax in enumerate(line):
