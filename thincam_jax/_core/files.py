@@ -2,10 +2,14 @@
 
 import contextlib
 import errno
+import io
 import os
 import stat
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 from thincam_jax._core.memory import refuse_if_too_large
 
@@ -75,6 +79,19 @@ def read_regular(path: str | os.PathLike[str]) -> bytes:
         if status.st_size > _SMALL:
             refuse_if_too_large(str(path), status.st_size, "give a smaller file")
         return file.read(status.st_size)
+
+
+def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """Arrays of an .npz file, unpacked, as `numpy.savez` writes it.
+
+    **Errors**: as of `read_regular`; many kinds for a damaged file, as NumPy takes its headers for
+    Python.
+    """
+    content = io.BytesIO(read_regular(path))
+    if any(entry.compress_type for entry in zipfile.ZipFile(content).infolist()):
+        raise ValueError("its arrays are packed")
+    with np.load(content, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
 
 
 _SMALL = 2**20  # bytes that are read without asking for the memory

@@ -16,6 +16,8 @@ from thincam_jax.measured.read import list_captures as list_captures
 from thincam_jax.measured.read import read_image as read_image
 from thincam_jax.measured.read import read_images as read_images
 from thincam_jax.measured.read import read_mask as read_mask
+from thincam_jax.measured.sensor import SensorCalibration as SensorCalibration
+from thincam_jax.measured.sensor import measure_sensor as measure_sensor
 from thincam_jax.measured.write import log_text as log_text
 from thincam_jax.measured.write import to_display as to_display
 from thincam_jax.measured.write import write_image as write_image

@@ -4,7 +4,6 @@ import hashlib
 import io
 import math
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import scipy
 from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 
 from thincam_jax._core.checks import Shape
-from thincam_jax._core.files import read_regular, write_whole
+from thincam_jax._core.files import read_arrays, write_whole
 from thincam_jax._core.precision import product
 from thincam_jax._core.text import of_error
 from thincam_jax.imaging.operators.base import (
@@ -161,14 +160,13 @@ class ReducedMatrix(AbstractOperator):
         """
         rows, size = _rows(matrix), _rows(matrix).shape[1]
         again = f"make it anew with ReducedMatrix.of and save it as {path}"
-        content = io.BytesIO(read_regular(path))
         try:
-            if any(entry.compress_type for entry in zipfile.ZipFile(content).infolist()):
-                raise ValueError("its arrays are packed")
-            with np.load(content, allow_pickle=False) as file:
-                mark, shape = str(file["mark"]), tuple(int(n) for n in file["in_shape"])
-                values, vectors = file["values"], file["vectors"]
-        except Exception as error:  # of many kinds, as NumPy takes the headers for Python
+            file = read_arrays(path)
+            mark, shape = str(file["mark"]), tuple(int(n) for n in file["in_shape"])
+            values, vectors = file["values"], file["vectors"]
+        except OSError:
+            raise
+        except Exception as error:  # of many kinds
             raise ValueError(f"{path} is no reduced matrix ({of_error(error)}); {again}") from error
         if mark != _mark(rows):
             raise ValueError(f"{path} belongs to another matrix than the one given; {again}")

@@ -1,0 +1,199 @@
+"""A sensor's calibration: against simulated sensors whose numbers are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thincam_jax.measured import ExposedFrames, MeasurementError, SensorCalibration, measure_sensor
+
+SHAPE, FULL = (61, 90), 4095
+GAIN, READ = 0.35, 6.0  # counts per electron, electrons
+TIMES = (0.005, 0.02, 0.05, 0.1, 0.2)  # s
+LIGHT = 34_000.0  # electrons/s
+HOT, DEAD, DIM, NOISY = (4, 7), (30, 41), (50, 3), (17, 80)
+ODD = HOT, DEAD, DIM, NOISY
+
+
+class Sensor:
+    """Poisson electrons of light and dark current, read noise, an offset that differs."""
+
+    def __init__(self, seed=1):
+        self.random = random = np.random.default_rng(seed)
+        self.offset = 60 + 2 * random.standard_normal(SHAPE)  # counts
+        self.current = np.full(SHAPE, 150.0)  # electrons/s
+        self.read = np.full(SHAPE, READ)
+        self.response = 1 + 0.02 * random.standard_normal(SHAPE)
+        self.response *= 1 + 0.2 * np.cos(np.arange(SHAPE[1]) / 30)  # a lens's or lamp's shading
+        self.offset[HOT] += 700
+        self.response[DEAD], self.response[DIM] = 0.0, 0.5 * self.response[DIM]
+        self.read[NOISY] = 10 * READ
+        self.good = np.ones(SHAPE, bool)
+        self.good[tuple(np.transpose(ODD))] = False
+        self.response /= self.response[self.good].mean()
+
+    def expose(self, exposure, light, count, flicker=0.0):
+        lamp = 1 + flicker * self.random.standard_normal((count, 1, 1))
+        rate = light * self.response * lamp + self.current
+        electrons = self.random.poisson(rate * exposure, (count, *SHAPE))
+        noise = self.read * self.random.standard_normal((count, *SHAPE))
+        counts = np.rint(self.offset + GAIN * (electrons + noise))
+        return np.clip(counts, 0, FULL).astype(np.uint16)
+
+    def taken(self, exposure, frames=6, darks=9, light=LIGHT, flicker=0.0):
+        lit = self.expose(exposure, light, frames, flicker)
+        return ExposedFrames(exposure, lit, self.expose(exposure, 0.0, darks))
+
+    def level(self, exposure):
+        return self.offset + GAIN * self.current * exposure
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    return Sensor()
+
+
+@pytest.fixture(scope="module")
+def found(sensor):
+    return measure_sensor([sensor.taken(one) for one in TIMES], FULL)
+
+
+def test_numbers_have_no_bias_and_honest_errors(sensor):
+    """Of many measurements of one sensor, with new noise each."""
+    every = [
+        measure_sensor([sensor.taken(t, 4, 4) for t in (0.02, 0.1, 0.2)], FULL) for _ in range(30)
+    ]
+    for name, truth in (("conversion_gain", GAIN), ("read_noise", READ)):
+        errors = np.array([getattr(one, f"{name}_error") for one in every])
+        z = (np.array([getattr(one, name) for one in every]) - truth) / errors
+        assert abs(z.mean()) < 3 / 30**0.5 and 0.7 < z.std() < 1.35, name
+        assert errors.mean() < 0.02 * truth
+
+
+def test_maps_have_no_bias_and_honest_errors(sensor, found):
+    good = sensor.good & ~found.defective
+    assert good.sum() >= sensor.good.sum() - 2
+    for name, truth in (
+        ("dark_level", sensor.level(found.exposure)),
+        ("dark_rate", GAIN * sensor.current),
+        ("response", sensor.response),
+    ):
+        z = (getattr(found, name) - truth)[good] / getattr(found, f"{name}_error")[good]
+        assert abs(z.mean()) < 0.05, name  # 0.014 by chance
+        assert abs(np.mean(z**2) - 1) < 0.08, name  # 0.02 by chance
+
+
+def test_defective_pixels_are_found(found):
+    assert all(found.defective[one] for one in ODD)
+
+
+def test_line_of_photon_transfer_is_that_of_numpy(sensor):
+    """The pair of two frames of EMVA 1288 in place of sums of squares, and a fit by NumPy."""
+    series = [sensor.taken(one, 2, 2) for one in TIMES]
+    found = measure_sensor(series, FULL)
+    good, points = ~found.defective, []
+    for one in series:
+        lit, dark = one.frames[:, good].astype(float), one.dark[:, good].astype(float)
+        pair = [np.var(both[0] - both[1]) / 2 for both in (lit, dark)]
+        points.append((lit.mean() - dark.mean(), pair[0] - pair[1]))
+    means, excess = np.transpose(points)
+    np.testing.assert_allclose(found.photon_transfer[:, 0], means, rtol=1e-9)
+    np.testing.assert_allclose(found.photon_transfer[:, 1], excess, rtol=2e-3)
+    weights = 1 / found.photon_transfer[:, 2]
+    slope = np.linalg.lstsq((weights * means)[:, None], weights * excess, rcond=None)[0][0]
+    assert found.conversion_gain == pytest.approx(slope, abs=0.2 * found.conversion_gain_error)
+
+
+def test_flicker_of_the_lamp_is_no_noise(sensor):
+    found = measure_sensor([sensor.taken(t, 8, 8, flicker=0.05) for t in TIMES], FULL)
+    assert abs(found.conversion_gain - GAIN) < 4 * found.conversion_gain_error
+
+
+def test_exposures_that_are_too_bright_are_left_out(sensor):
+    series = [sensor.taken(one) for one in (*TIMES, 0.26, 0.5)]  # 0.9 of full scale, saturated
+    found = measure_sensor(series, FULL)
+    assert len(found.photon_transfer) == len(TIMES)
+    assert abs(found.conversion_gain - GAIN) < 4 * found.conversion_gain_error
+    with pytest.raises(MeasurementError, match="over 0.8 of full scale; give a shorter"):
+        measure_sensor(series[-1:], FULL)
+
+
+def test_corrected_frames_are_even_and_have_the_variance_that_they_say(sensor, found):
+    exposure = 0.08
+    truth = GAIN * LIGHT * exposure
+    light, variance = found.at(exposure).correct(sensor.expose(exposure, LIGHT, 1)[0])
+    good = ~found.defective
+    z = (light[good] - truth) / np.sqrt(variance[good])
+    assert abs(z.mean()) < 0.1 and abs(np.mean(z**2) - 1) < 0.1
+    assert not light[~good].any() and not variance[~good].any()
+    dark, variance = found.at(0.4).correct(sensor.expose(0.4, 0.0, 1)[0])
+    assert abs(np.mean(dark[good] / np.sqrt(variance[good]))) < 0.1
+
+
+def test_one_exposure_says_nothing_of_another(sensor):
+    one = measure_sensor([sensor.taken(0.1)], FULL)
+    assert one.dark_rate is None and one.at(0.1) is one
+    assert abs(one.conversion_gain - GAIN) < 4 * one.conversion_gain_error
+    with pytest.raises(MeasurementError, match="all dark frames have 0.1 s .* a second exposure"):
+        one.at(0.2)
+
+
+def test_a_mosaic_has_the_mean_response_1_at_each_place(sensor):
+    colours = np.where(np.add.outer(*map(np.arange, SHAPE)) % 2, 1.0, 0.4)
+    coloured = Sensor()
+    coloured.response = coloured.response * colours
+    series = [coloured.taken(one) for one in TIMES]
+    found = measure_sensor(series, FULL, mosaic=True)
+    for i in (0, 1):
+        for j in (0, 1):
+            good = ~found.defective[i::2, j::2]
+            assert found.response[i::2, j::2][good].mean() == pytest.approx(1, abs=1e-5)
+    assert (~found.defective).sum() >= sensor.good.sum() - 2
+
+
+def test_a_file_keeps_it(found, tmp_path):
+    for one in (found, replace(found, dark_rate=None, dark_rate_error=None)):
+        again = SensorCalibration.load(one.save(tmp_path / "sensor.npz"))
+        for name, value in vars(one).items():
+            assert np.array_equal(getattr(again, name), value), name
+
+
+def test_damaged_files_are_refused_in_a_line(found, tmp_path):
+    path = found.save(tmp_path / "sensor.npz")
+    whole = path.read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:400] + b"\xff" * 9 + whole[409:], b"text"):
+        path.write_bytes(damaged)
+        with pytest.raises(MeasurementError, match="is no calibration of a sensor") as refused:
+            SensorCalibration.load(path)
+        assert "\n" not in str(refused.value)
+    for changed in (
+        {"response": found.response[:-1]},
+        {"dark_level": np.full(SHAPE, np.nan)},
+        {"conversion_gain": -1.0},
+        {"conversion_gain": np.ones(2)},
+        {"unknown": 1.0},
+    ):
+        np.savez(path, **{**vars(found), **changed})
+        with pytest.raises(MeasurementError, match="is no calibration of a sensor") as refused:
+            SensorCalibration.load(path)
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: [], "one exposure or more"),
+        (lambda one: [one, replace(one, frames=one.frames[:, 1:], dark=one.dark[:, 1:])], "same"),
+        (lambda one: [replace(one, dark=one.dark * 0)], "raise the camera's black level"),
+        (lambda one: [replace(one, frames=one.dark)], "give more light|does not grow"),
+        (lambda one: [replace(one, frames=one.dark[:6] + np.uint16(200))], "does not grow"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(sensor, change, message):
+    with pytest.raises(MeasurementError, match=message):
+        measure_sensor(change(sensor.taken(0.1)), FULL)
+
+
+def test_frames_of_other_pixels_are_refused(found):
+    with pytest.raises(MeasurementError, match="with the frame's region and binning"):
+        found.correct(np.zeros((4, 5)))

@@ -1,0 +1,303 @@
+r"""Calibration of a sensor: dark level, response, noise and defective pixels.
+
+A pixel with the dark level b at the exposure :math:`t_0`, to which each second adds r counts, and
+of response f, 1 in the mean, has at the exposure t and for light of u counts
+
+.. math::
+    \mathrm{E}\,y = b + r (t - t_0) + f u, \qquad
+    \mathrm{Var}\,y = K^2 \sigma_d^2 + \tfrac{1}{12} + K (\mathrm{E}\,y - b + r t_0)
+
+with K counts per electron, the read noise :math:`\sigma_d` in electrons, and 1/12 for whole counts.
+The electrons of light and of dark current are Poisson numbers. So the variance grows with the mean,
+and K is the slope: the photon transfer method (EMVA 1288, release 3.1, equation 9).
+"""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import scipy
+from jaxtyping import Bool, Float, Real
+
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.files import MeasurementError, read_arrays, write_whole
+from thincam_jax._core.text import of_error
+from thincam_jax.measured.exposures import ExposedFrames
+
+_ROUNDING = 1 / 12  # variance of whole counts
+_BRIGHTEST = 0.8  # of full scale
+_FEW = 0.01  # share of the pixels that may be brighter, and of dark counts that may be 0
+
+_PLACES = tuple(np.s_[i::2, j::2] for i in (0, 1) for j in (0, 1))  # of a Bayer pattern
+_SURE = 4.0  # standard errors of the conversion gain that it has to be
+
+
+@checked
+@dataclass(frozen=True, eq=False)
+class SensorCalibration:
+    """A sensor's dark level, response and noise, as `measure_sensor` finds them.
+
+    - `exposure`: s, of the frames that it corrects; see `at`.
+    - `dark_level`, `dark_rate`: b, counts; r, counts/s, None where all dark frames have one
+      exposure. `response`: f, 0 in defective pixels.
+    - `defective`: pixels that are hot, dead, or unlike their neighbours in level or noise.
+    - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; with one exposure, with
+      that of the dark current.
+    - `full_scale`: largest count.
+    - `photon_transfer`: mean light, counts, additional variance and its standard error, counts², of
+      each level.
+    - names with `_error`: standard errors.
+
+    It holds for the camera's gain, black level, pixel format, binning and region.
+
+    **Errors**: MeasurementError for maps of several shapes, and for no gain or response.
+    """
+
+    exposure: float
+    dark_level: Float[np.ndarray, "y x"]
+    dark_level_error: Float[np.ndarray, "y x"]
+    response: Float[np.ndarray, "y x"]
+    response_error: Float[np.ndarray, "y x"]
+    defective: Bool[np.ndarray, "y x"]
+    conversion_gain: float
+    conversion_gain_error: float
+    read_noise: float
+    read_noise_error: float
+    full_scale: int
+    photon_transfer: Float[np.ndarray, "level 3"]
+    dark_rate: Float[np.ndarray, "y x"] | None = None
+    dark_rate_error: Float[np.ndarray, "y x"] | None = None
+
+    def __post_init__(self):
+        every = {name: np.shape(one) for name, one in vars(self).items()}
+        shapes = {n for name, n in every.items() if len(n) == 2 and name != "photon_transfer"}
+        if len(shapes) > 1 or (self.dark_rate is None) != (self.dark_rate_error is None):
+            raise MeasurementError(f"maps of the shapes {shapes}; give all for the same pixels")
+        sound = (self.response > 0) | self.defective
+        if not (sound.all() and min(self.exposure, self.conversion_gain, self.full_scale) > 0):
+            raise MeasurementError("a response or gain is not above 0; measure the sensor again")
+
+    def at(self, exposure: float) -> "SensorCalibration":
+        """Calibration for frames of another exposure, s.
+
+        **Errors**: MeasurementError where all dark frames have one exposure.
+        """
+        later = exposure - self.exposure
+        if self.dark_rate is None or self.dark_rate_error is None:
+            if abs(later) > 1e-3 * self.exposure:
+                raise MeasurementError(
+                    f"all dark frames have {self.exposure:g} s and the frame has {exposure:g} s; "
+                    "measure the sensor with dark frames of a second exposure"
+                )
+            return self
+        error = np.hypot(self.dark_level_error, self.dark_rate_error * later)
+        level = self.dark_level + self.dark_rate * later
+        return replace(self, exposure=exposure, dark_level=level, dark_level_error=error)
+
+    def correct(
+        self, counts: Real[np.ndarray, "y x"]
+    ) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
+        """Light u of a frame, counts, and its variance; both 0 in defective pixels.
+
+        The variance is that of photon noise, estimated from the pixel's own count, of read noise,
+        and of the calibration.
+
+        **Errors**: MeasurementError for other pixels.
+        """
+        if counts.shape != self.response.shape:
+            raise MeasurementError(
+                f"the sensor was measured with {self.response.shape} pixels and the frame has "
+                f"{counts.shape}; measure it with the frame's region and binning"
+            )
+        light, gain = counts - self.dark_level, self.conversion_gain
+        response = np.where(self.defective, 1, self.response)
+        current = 0.0 if self.dark_rate is None else self.dark_rate * self.exposure
+        variance = (gain * self.read_noise) ** 2 + _ROUNDING + gain * np.maximum(light + current, 0)
+        variance = variance + self.dark_level_error**2
+        variance = variance + (light * self.response_error / response) ** 2
+        return ~self.defective * light / response, ~self.defective * variance / response**2
+
+    def save(self, path: str | Path) -> Path:
+        """Write it to one file, .npz."""
+        file = io.BytesIO()
+        np.savez(file, **{name: one for name, one in vars(self).items() if one is not None})
+        return write_whole(path, file.getvalue())
+
+    @classmethod
+    def load(cls, path: str | Path) -> "SensorCalibration":
+        """Read what `save` has written.
+
+        **Errors**: MeasurementError, one line, for a damaged file or another one.
+        """
+        try:
+            found = read_arrays(path)
+            return cls(**{name: one if one.ndim else one.item() for name, one in found.items()})
+        except OSError:
+            raise
+        except Exception as error:  # of many kinds, as NumPy takes the headers for Python
+            raise MeasurementError(
+                f"{path} is no calibration of a sensor ({of_error(error)}); measure it again, and "
+                "save it under this name"
+            ) from error
+
+
+@checked
+def measure_sensor(
+    series: Sequence[ExposedFrames],
+    full_scale: int = 4095,
+    *,
+    outlier: float = 6.0,
+    mosaic: bool = False,
+) -> SensorCalibration:
+    r"""Measure a sensor with frames of an evenly lit surface and dark frames.
+
+    - `series`: one exposure or more; several show the dark current, and the line of photon
+      transfer. `Acquisition.exposed` reads them from a rig's store.
+    - `outlier`: difference from the neighbours, in standard deviations, of a defective pixel.
+    - `mosaic`: of a Bayer pattern: the mean response is 1 at each of its four places, so that the
+      colour of the light has no effect.
+
+    With the means :math:`Y_j` of light over all good pixels, and :math:`V_j` of the variance of lit
+    minus that of dark frames, the slope is :math:`K = \sum_j w_j V_j / \sum_j w_j Y_j`, unbiased
+    for any weights. The scatter over the pixels gives the errors, whatever the noise's
+    distribution. Exposures at which more than 1 % of the pixels exceed 0.8 of full scale are used
+    for the dark level only. Unevenness of the light counts as response.
+
+    **Errors**: MeasurementError for no exposures, frames of other pixels, a black level that is too
+    low, light that is too bright, and light without photon noise.
+
+    >>> random = np.random.default_rng(0)
+    >>> def taken(exposure):
+    ...     light = 0.5 * random.poisson(2e4 * exposure, (8, 40, 60))
+    ...     noise = random.normal(60, 3, (16, 40, 60))
+    ...     return ExposedFrames(exposure, np.rint(light + noise[:8]), np.rint(noise[8:]))
+    >>> sensor = measure_sensor([taken(0.05), taken(0.2)])
+    >>> bool(abs(sensor.conversion_gain - 0.5) < 4 * sensor.conversion_gain_error)
+    True
+    """
+    if not series or len({one.frames.shape[1:] for one in series}) > 1:
+        raise MeasurementError("give one exposure or more, all with frames of the same pixels")
+    if max(np.mean(one.dark == 0) for one in series) > _FEW:
+        raise MeasurementError("dark counts of 0 hide their noise; raise the camera's black level")
+    times = np.array([one.exposure for one in series])
+    frames, darks = (np.array([len(getattr(o, n)) for o in series]) for n in ("frames", "dark"))
+    dark, dark_variance, light, variance, highest = np.swapaxes(list(map(_moments, series)), 0, 1)
+    used = np.mean(light + dark > _BRIGHTEST * full_scale, axis=(1, 2)) <= _FEW
+    if not used.any():
+        raise MeasurementError("the light is over 0.8 of full scale; give a shorter exposure")
+    # Weights of the dark means that give the line of each pixel, and of the variances.
+    middle, degrees = float(darks @ times / darks.sum()), darks - 1
+    moment = darks * (times - middle)
+    has_rate = bool(moment @ times > 1e-6 * darks.sum() * middle**2)
+    line = np.stack([darks / darks.sum(), has_rate * moment / (moment @ times or 1.0)])
+    level, rate = np.tensordot(line, dark, 1)
+    noise = np.tensordot(degrees / degrees.sum(), dark_variance, 1)
+    counted = used * frames
+    total = np.tensordot(counted, light, 1)
+
+    odd = (highest[used] >= full_scale).any(axis=0) | ~(total > 0)
+    least = max(float(np.median(noise)), _ROUNDING)
+    parts = *(line**2 / darks), counted  # of the variance of a frame
+    for values, part in zip((level, rate, total), parts, strict=True):
+        odd |= _stands_out(values, outlier, float(np.sqrt(least * part.sum())))
+    high, half = scipy.special.chdtri(degrees.sum(), [scipy.special.ndtr(-outlier), 0.5])
+    odd |= noise > least * high / half
+    good, scale = ~odd, np.ones_like(total)
+    for place in _PLACES if mosaic else (np.s_[:, :],):
+        scale[place] = total[place][good[place]].sum() / max(good[place].sum(), 1)
+    if not (scale > 0).all():
+        raise MeasurementError("the frames are no brighter than the dark ones; give more light")
+
+    gain, in_gain, points = _photon_transfer(
+        light[used][:, good], (variance - dark_variance)[used][:, good]
+    )
+    # What each pixel adds to the errors: of the read noise's variance, then of it in electrons.
+    current = rate[good] * (degrees @ times / degrees.sum())
+    read = noise[good] - gain * current - _ROUNDING
+    in_read = (read - read.mean()) / read.size - current.mean() * in_gain
+    deviation = np.sqrt(max(read.mean(), np.linalg.norm(in_read)))
+    in_electrons = in_read / (2 * deviation * gain) - deviation / gain**2 * in_gain
+
+    constant = max(float(read.mean()), 0.0) + _ROUNDING
+    of_dark = np.maximum(constant + gain * np.multiply.outer(times, rate), _ROUNDING)
+    of_light = np.maximum(of_dark + gain * light, _ROUNDING)
+    of_total = np.tensordot(counted, of_light, 1) + np.tensordot(
+        counted * frames / darks, of_dark, 1
+    )
+    errors = np.sqrt(np.tensordot(line**2 / darks, of_dark, 1))
+    maps = {
+        "dark_level": level,
+        "dark_level_error": errors[0],
+        "response": good * total / scale,
+        "response_error": good * np.sqrt(of_total) / scale,
+    }
+    if has_rate:
+        maps |= {"dark_rate": rate, "dark_rate_error": errors[1]}
+    return SensorCalibration(
+        exposure=middle,
+        **{name: one.astype(np.float32) for name, one in maps.items()},
+        defective=odd,
+        conversion_gain=gain,
+        conversion_gain_error=float(np.linalg.norm(in_gain)),
+        read_noise=float(np.sqrt(max(read.mean(), 0.0)) / gain),
+        read_noise_error=float(np.linalg.norm(in_electrons)),
+        full_scale=full_scale,
+        photon_transfer=points,
+    )
+
+
+def _moments(one: ExposedFrames) -> tuple[np.ndarray, ...]:
+    """Maps of the dark mean and variance, of the light's mean and variance, and of the maximum."""
+    dark = one.dark.mean(axis=0, dtype=float)
+    light = one.frames.mean(axis=0, dtype=float) - dark
+    highest = np.maximum(one.frames.max(axis=0), one.dark.max(axis=0))
+    # A lamp's flicker changes all pixels in proportion to their light, and is no noise.
+    profile = light / (light.mean() or 1.0)
+    return (
+        dark,
+        _variance(one.dark, np.ones_like(dark)),
+        light,
+        _variance(one.frames, profile),
+        highest,
+    )
+
+
+def _variance(frames: np.ndarray, profile: np.ndarray) -> np.ndarray:
+    """Variance among frames, without what all their pixels have in common."""
+    mean, squares = frames.mean(axis=0, dtype=float), np.zeros_like(profile)
+    for frame in frames:
+        squares += (frame - mean - (frame.mean(dtype=float) - mean.mean()) * profile) ** 2
+    return squares / (len(frames) - 1)
+
+
+def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """K, what each pixel adds to its error, and the points of the line (level, 3).
+
+    - `light`, `excess`: mean and additional variance (level, pixel).
+    """
+    means, weights = light.mean(axis=1), np.ones(len(light))
+    for _ in range(2):  # the second time weighted by what the first leaves
+        gain = float(weights @ excess.mean(axis=1) / (weights @ means))
+        residual = excess - gain * light
+        scatter = residual.var(axis=1)
+        in_gain = weights @ residual / (weights @ means) / light.shape[1]
+        weights = means / np.maximum(scatter, _ROUNDING)
+    if not gain > _SURE * np.linalg.norm(in_gain):
+        raise MeasurementError("the variance does not grow with the light; give raw frames")
+    points = means, excess.mean(axis=1), np.sqrt(scatter / light.shape[1])
+    return gain, in_gain, np.stack(points, axis=1)
+
+
+def _stands_out(values: np.ndarray, outlier: float, error: float) -> np.ndarray:
+    """Pixels that differ from the median of their 5×5 neighbours of one colour.
+
+    - `error`: least standard deviation of the values.
+    """
+    found = np.zeros(values.shape, bool)
+    for place in _PLACES:
+        difference = np.abs(values[place] - scipy.ndimage.median_filter(values[place], 5))
+        spread = 1.4826 * float(np.median(difference))
+        found[place] = difference > outlier * max(spread, error)
+    return found
