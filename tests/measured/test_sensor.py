@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thincam_jax.measured import ExposedFrames, MeasurementError, SensorCalibration, measure_sensor
+from thincam_jax.measured import (
+    ExposedFrames,
+    MeasurementError,
+    Preparation,
+    Raw,
+    SensorCalibration,
+    measure_sensor,
+    prepare,
+)
+from thincam_jax.studies import pixel_noise
 
 SHAPE, FULL = (61, 90), 4095
 GAIN, READ = 0.35, 6.0  # counts per electron, electrons
@@ -197,3 +206,64 @@ def test_what_cannot_be_measured_is_refused(sensor, change, message):
 def test_frames_of_other_pixels_are_refused(found):
     with pytest.raises(MeasurementError, match="with the frame's region and binning"):
         found.correct(np.zeros((4, 5)))
+
+
+def prepared(sensor, found, options, seen=None, **given):
+    """Even light at 80 ms, prepared with the calibration."""
+    capture = Raw(sensor.expose(0.08, LIGHT, 1)[0] if seen is None else seen, bits=12)
+    return prepare(capture, capture, found.at(0.08), options, **given)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        Preparation(capture_scale="none"),
+        Preparation(downsample=3, corner=(2, 8)),
+        Preparation(bayer="GRBG", corner=(2, 8)),
+        Preparation(downsample=2, corner=(2, 8), crop=((2, 50), (5, 81))),
+    ],
+)
+def test_a_preparation_is_even_and_has_the_variance_that_it_says(sensor, found, options):
+    ready = prepared(sensor, found, options)
+    assert ready.variance is not None and ready.variance.shape == ready.capture.shape
+    z = ready.capture - GAIN * LIGHT * 0.08 / FULL / ready.log.capture_divisor
+    z = z[ready.valid] / np.sqrt(ready.variance[ready.valid])
+    assert abs(z.mean()) < 0.12 and abs(np.mean(z**2) - 1) < 0.12
+    assert np.array_equal(np.isfinite(ready.variance), ready.valid)
+    raw = np.sqrt(GAIN**2 * READ**2 + GAIN**2 * (LIGHT + 150) * 0.08)
+    assert ready.log.capture.noise == pytest.approx(raw, rel=0.05)  # of an uneven response
+    noise = pixel_noise(ready)
+    assert "sensor's calibration" in noise.found
+    assert noise.counts == pytest.approx(ready.log.capture.noise)
+
+
+def test_superpixels_have_the_variance_of_their_samples(sensor, found):
+    even = {
+        n: m[:60] if np.ndim(m) == 2 and m.shape == SHAPE else m for n, m in vars(found).items()
+    }
+    options = Preparation(bayer="RGGB", demosaicing="superpixel", corner=(2, 8))
+    seen = sensor.expose(0.08, LIGHT, 1)[0][:60]
+    ready = prepared(sensor, SensorCalibration(**even), options, seen)
+    z = ready.capture - GAIN * LIGHT * 0.08 / FULL / ready.log.capture_divisor
+    for channel in range(3):
+        here = ready.valid[channel]
+        squares = z[channel][here] ** 2 / ready.variance[channel][here]
+        assert abs(np.mean(squares) - 1) < 0.15
+    mean = [np.mean(one[np.isfinite(one)]) for one in ready.variance]
+    assert mean[1] == pytest.approx(mean[0] / 2, rel=0.1)
+
+
+def test_defective_pixels_are_not_valid_in_a_preparation(sensor, found):
+    dead = np.zeros(SHAPE, bool)
+    dead[9, 9] = True
+    ready = prepared(sensor, found, Preparation(capture_scale="none"), dead=dead)
+    assert np.array_equal(ready.valid[0], ~(found.defective | dead))
+    assert ready.log.capture.dead == np.count_nonzero(found.defective) + 1
+    assert "sensor's calibration at 0.08 s" in ready.log.capture.background
+
+
+@pytest.mark.parametrize("pixels", [np.ones((5, 6), np.uint16), np.ones((*SHAPE, 3), np.uint16)])
+def test_a_preparation_of_other_pixels_is_refused(found, pixels):
+    raw = Raw(pixels, bits=12)
+    with pytest.raises(MeasurementError, match="the same region, binning and pixel format"):
+        prepare(raw, raw, found, Preparation(corner=(1, 4)))

@@ -1,6 +1,6 @@
 """Demosaicing: red, green and blue from the mosaic of a colour sensor."""
 
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 import scipy
@@ -59,6 +59,25 @@ def demosaic(
     return np.stack(channels, axis=-1)
 
 
+def demosaic_variance(
+    variance: np.ndarray, pattern: Pattern, method: Demosaicing, known: np.ndarray | None = None
+) -> np.ndarray:
+    """Variance of the values of `demosaic` for pixels of independent noise of a `variance`."""
+    sites, found = colour_sites(variance.shape, pattern), []
+    for colour in "RGB":
+        used = (sites[colour] if known is None else sites[colour] & known).astype(variance.dtype)
+        weight = _gather(used, colour, method)
+        total = _gather(used * variance, colour, method, 2)
+        found.append(total / np.where(weight > 0, weight, 1) ** 2)
+    return np.stack(found, axis=-1)
+
+
+def shifted_pattern(pattern: Pattern, top: int, left: int) -> Pattern:
+    """Pattern of the part of a mosaic that begins at a row and a column."""
+    rows, columns = (top % 2, 1 - top % 2), (left % 2, 1 - left % 2)
+    return cast(Pattern, "".join(pattern[2 * y + x] for y in rows for x in columns))
+
+
 @checked
 def demosaic_mask(
     mask: Bool[np.ndarray, "y x"], pattern: Pattern, method: Demosaicing = "bilinear"
@@ -79,14 +98,14 @@ def colour_sites(shape: tuple[int, ...], pattern: Pattern) -> dict[str, np.ndarr
     return {colour: mosaic == colour for colour in "RGB"}
 
 
-def _gather(values: np.ndarray, colour: str, method: Demosaicing) -> np.ndarray:
-    """Weighted sums of the samples that each value depends on."""
+def _gather(values: np.ndarray, colour: str, method: Demosaicing, power: int = 1) -> np.ndarray:
+    """Sums of the samples that each value depends on, by a power of their weights."""
     checks.choice("method", method, METHODS)
     rows, columns = values.shape
     if method == "bilinear":
         if min(rows, columns) < 2:
             raise ValueError(f"the mosaic has {rows}×{columns} pixels; give at least 2×2")
-        return scipy.ndimage.convolve(values, _KERNELS[colour], mode="constant")
+        return scipy.ndimage.convolve(values, _KERNELS[colour] ** power, mode="constant")
     if rows % 2 or columns % 2:
         raise ValueError(
             f"'superpixel' joins 2×2 pixels and the mosaic has {rows}×{columns}: cut off the last "

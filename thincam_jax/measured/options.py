@@ -9,6 +9,7 @@ import numpy as np
 from thincam_jax._core import checks
 from thincam_jax.measured.bayer import Demosaicing, Pattern
 from thincam_jax.measured.raw import MeasurementError, Raw
+from thincam_jax.measured.sensor import SensorCalibration
 
 Centre = Literal["centroid", "peak", "symmetry"]
 PsfChannels = Literal["each", "mean"]
@@ -164,6 +165,14 @@ def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
             raise MeasurementError(
                 f"the dark frame ({background.name}) has {_scale(background)} and the {name} "
                 f"{_scale(raw)}; read both with the same `bits`"
+            )
+    elif isinstance(background, SensorCalibration):
+        sensor, shape = background, background.response.shape
+        if (shape, sensor.full_scale) != (raw.pixels.shape, raw.full_scale):
+            raise MeasurementError(
+                f"the sensor was measured with {shape} pixels to {sensor.full_scale} counts and "
+                f"the {name} has {raw.pixels.shape} to {raw.full_scale:g}; measure it with the "
+                "same region, binning and pixel format, and give `bits`"
             )
     elif isinstance(background, str):
         if background != "corner":

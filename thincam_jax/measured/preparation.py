@@ -10,12 +10,13 @@ from jaxtyping import Bool, Float, Float32
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
-from thincam_jax.measured.bayer import demosaic, demosaic_mask
+from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaic_variance
 from thincam_jax.measured.options import Centre, Preparation, check_match
 from thincam_jax.measured.preparation_log import Centring, CleanUp, ImageLog, PreparationLog
 from thincam_jax.measured.raw import MeasurementError, Raw
+from thincam_jax.measured.sensor import SensorCalibration
 
-Background = Raw | float | int | Literal["corner"]
+Background = Raw | SensorCalibration | float | int | Literal["corner"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +28,15 @@ class Prepared:
     - `capture`: in fractions of full scale divided by `log.capture_divisor`.
     - `valid`: False where the capture is saturated or dead.
     - `log`: what the steps did.
+    - `variance`: of the capture, where a sensor's calibration is its background; infinite where not
+      valid. That values interpolated by "bilinear" are correlated is left out of block means.
     """
 
     psf: Float32[np.ndarray, "psf_channel k l"]
     capture: Float32[np.ndarray, "channel y x"]
     valid: Bool[np.ndarray, "channel y x"]
     log: PreparationLog
+    variance: Float32[np.ndarray, "channel y x"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,7 @@ class _Frame:
     values: np.ndarray  # (channel, y, x) float32
     saturated: np.ndarray  # bool
     known: np.ndarray  # bool; False where only dead pixels contribute
+    variance: np.ndarray  # 0 without a sensor's calibration
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -66,10 +71,11 @@ def prepare(
     1. Counts to fractions of full scale, float32.
     2. Background: subtract a dark frame (of the image's exposure), a number of counts, or
        "corner", the default: the mean of a square in the PSF's upper left corner, for both images,
-       because a lensless capture has no dark place. 0 subtracts nothing. `psf_background` is that
-       of the PSF where it differs. Negative values become 0.
-    3. Saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x) of the sensor
-       (`read_mask`), are not valid.
+       because a lensless capture has no dark place. 0 subtracts nothing. A `SensorCalibration` `at`
+       the image's exposure also divides by the response of each pixel and gives the variance.
+       `psf_background` is that of the PSF where it differs. Negative values become 0.
+    3. Saturated pixels (before the subtraction) and dead ones are not valid: those of `dead`, True
+       in a map (y, x) of the sensor (`read_mask`), and those that the calibration calls defective.
     4. Demosaicing, if the options name a Bayer pattern; then the capture's `crop`.
     5. The PSF onto the capture's pixels, with `psf_scale`.
     6. Exact means of square blocks of `downsample` pixels; remainders are cropped centrally.
@@ -103,10 +109,15 @@ def prepare(
     if options.psf_channels == "mean" and psf.channels != capture.channels:
         corners["capture"] = corner.mean(axis=0, keepdims=True)
     levels = {n: _level(b, raws[n], corners[n]) for n, b in backgrounds.items()}
-    noise = _noise((planes["psf"] - levels["psf"])[square].astype(np.float64), options)
-    planes = {n: planes[n] - levels[n] for n in planes}
     good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
-    frames = {n: _Frame(p, saturated[n], _known(good, p.shape)) for n, p in planes.items()}
+    frames = {
+        n: _Frame(p - levels[n], saturated[n], _known(good, p.shape), np.zeros_like(p))
+        for n, p in planes.items()
+    }
+    for n, background in backgrounds.items():
+        if isinstance(background, SensorCalibration):
+            frames[n] = _corrected(frames[n], raws[n], background)
+    noise = _noise(frames["psf"].values[square].astype(np.float64), options)
     logs = {n: _image_log(raws[n], backgrounds[n], levels[n], f) for n, f in frames.items()}
     frames = {n: replace(f, values=np.maximum(f.values, 0)) for n, f in frames.items()}
     if options.bayer is not None:
@@ -129,6 +140,10 @@ def prepare(
     image = _filled(frames["capture"], "capture")
     sums, divisor = _psf_divisor(light, options), _capture_divisor(image, options)
     valid = frames["capture"].known & ~frames["capture"].saturated
+    variance = None
+    if isinstance(background, SensorCalibration):
+        variance = np.where(valid, frames["capture"].variance / divisor**2, np.inf)
+        variance = variance.astype(np.float32)
     log = PreparationLog(
         options=options,
         psf=logs["psf"],
@@ -145,11 +160,17 @@ def prepare(
         capture_divisor=divisor,
     )
     light = (light / sums[:, None, None]).astype(np.float32)
-    return Prepared(light, (image.astype(np.float64) / divisor).astype(np.float32), valid, log)
+    image = (image.astype(np.float64) / divisor).astype(np.float32)
+    return Prepared(light, image, valid, log, variance)
 
 
 def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Frame) -> ImageLog:
     kind = background if isinstance(background, str) else "number"
+    noise = None
+    if isinstance(background, SensorCalibration):
+        kind = f"sensor's calibration at {background.exposure:g} s"
+        trusted = frame.variance[frame.known & ~frame.saturated]
+        noise = raw.full_scale * float(np.sqrt(trusted.mean(dtype=float))) if trusted.size else 0.0
     maximum = raw.pixels.max()
     return ImageLog(
         name=raw.name,
@@ -165,7 +186,16 @@ def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Fram
         clipped=int(np.count_nonzero(frame.values < 0)),
         saturated=int(frame.saturated.sum()),
         dead=int((~frame.known).sum()) // raw.channels,
+        noise=noise,
     )
+
+
+def _corrected(frame: _Frame, raw: Raw, sensor: SensorCalibration) -> _Frame:
+    """The frame in counts of pixels of equal response, with their variance."""
+    light, variance = (one[None].astype(np.float32) for one in sensor.correct(raw.pixels))
+    known = frame.known & ~sensor.defective
+    scale = raw.full_scale
+    return _Frame(light / scale, frame.saturated, known, variance / scale**2)
 
 
 def _in_full_scale(raw: Raw) -> np.ndarray:
@@ -195,6 +225,8 @@ def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
     """Level to subtract, in fractions of full scale."""
     if isinstance(background, Raw):
         return _in_full_scale(background)
+    if isinstance(background, SensorCalibration):
+        return background.dark_level[None] / np.float32(raw.full_scale)
     if isinstance(background, str):
         return corner
     return np.full((1, 1, 1), background / raw.full_scale, np.float32)
@@ -210,7 +242,9 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
     if frame.saturated.any():
         saturated = demosaic_mask(frame.saturated[0], pattern, method)
     has = ~nothing if known is None else demosaic_mask(known, pattern, method)
-    return _Frame(*(np.moveaxis(plane, -1, 0) for plane in (colours, saturated, has)))
+    variance = demosaic_variance(frame.variance[0], pattern, method, known)
+    planes = colours, saturated, has, variance
+    return _Frame(*(np.moveaxis(plane, -1, 0) for plane in planes))
 
 
 def _cropped(frame: _Frame, crop: tuple[tuple[int, int], tuple[int, int]]) -> _Frame:
@@ -221,7 +255,7 @@ def _cropped(frame: _Frame, crop: tuple[tuple[int, int], tuple[int, int]]) -> _F
             "smaller one"
         )
     parts = [slice(*part) for part in crop]
-    return _Frame(*(plane[:, *parts] for plane in (frame.values, frame.saturated, frame.known)))
+    return _Frame(*(plane[:, *parts] for plane in vars(frame).values()))
 
 
 def _known(known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -249,7 +283,8 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
         for plane in planes
     ]
     light = np.maximum(np.stack(values), 0).astype(frame.values.dtype)
-    return _Frame(light, np.zeros(light.shape, bool), np.ones(light.shape, bool))
+    zeros = np.zeros_like(light)
+    return _Frame(light, zeros > 0, zeros == 0, zeros)
 
 
 def _downsampled(
@@ -269,13 +304,15 @@ def _downsampled(
 def _means(frame: _Frame, factor: int) -> _Frame:
     """Means of the known pixels of each block, summed in float64; 0 where none is known."""
     kept = central_blocks(frame.values.shape[1:], factor)
-    values, saturated, known = (
-        plane[:, *kept] for plane in (frame.values, frame.saturated, frame.known)
-    )
+    values, saturated, known, variance = (plane[:, *kept] for plane in vars(frame).values())
     total = block_sum(np.where(known, values, 0), factor, np.float64)
     count = block_sum(known, factor)
     means = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
-    return _Frame(means.astype(values.dtype), block_sum(saturated, factor) > 0, count > 0)
+    spread = block_sum(np.where(known, variance, 0), factor, np.float64) / np.maximum(count, 1) ** 2
+    kind = values.dtype
+    return _Frame(
+        means.astype(kind), block_sum(saturated, factor) > 0, count > 0, spread.astype(kind)
+    )
 
 
 def _filled(frame: _Frame, name: str) -> np.ndarray:

@@ -15,7 +15,8 @@ class ImageLog:
     - `background`: "corner", "number" or the name of the dark frame; `level`: what was subtracted,
       the mean of each channel in fractions of full scale.
     - `clipped`: pixels that this made negative, and that became 0.
-    - `saturated`, `dead`: pixels.
+    - `saturated`, `dead`: pixels. `noise`: standard deviation of the others, root mean square in
+      counts, by a sensor's calibration.
     """
 
     name: str
@@ -31,6 +32,7 @@ class ImageLog:
     clipped: int
     saturated: int
     dead: int
+    noise: float | None = None
 
 
 @dataclass(frozen=True)

@@ -50,13 +50,18 @@ class PixelNoise:
 
 
 def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
-    """Noise of a prepared capture: of a raw pixel's `counts`, or estimated from the capture."""
-    log = prepared.log
+    """Noise of a prepared capture: of a raw pixel's `counts`, or estimated from the capture.
+
+    Where a sensor's calibration is the capture's background, the counts are its.
+    """
+    log, how = prepared.log, "given"
+    if counts is None and log.capture.noise is not None:
+        counts, how = log.capture.noise, "photon and read noise by the sensor's calibration"
     # One count of a raw pixel in units of the prepared capture.
     of_a_count = 1 / (log.capture.full_scale * log.options.downsample * log.capture_divisor)
     if counts is not None:
         noise = counts * of_a_count
-        return PixelNoise(noise, noise / of_a_count, "given")
+        return PixelNoise(noise, noise / of_a_count, how)
     how = "estimated from the finest detail at each brightness"
     light, valid = (jnp.asarray(array) for array in (prepared.capture, prepared.valid))
     noise = 0.0
