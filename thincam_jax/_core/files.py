@@ -82,11 +82,7 @@ def read_regular(path: str | os.PathLike[str]) -> bytes:
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Arrays of an .npz file, unpacked, as `numpy.savez` writes it.
-
-    **Errors**: as of `read_regular`; many kinds for a damaged file, as NumPy takes its headers for
-    Python.
-    """
+    """Arrays of an .npz file as `numpy.savez` writes it; errors of many kinds for others."""
     content = io.BytesIO(read_regular(path))
     if any(entry.compress_type for entry in zipfile.ZipFile(content).infolist()):
         raise ValueError("its arrays are packed")

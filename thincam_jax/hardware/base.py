@@ -13,6 +13,7 @@ import numpy as np
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity, whole
+from thincam_jax.measured.bayer import PATTERNS, Pattern, shifted_pattern
 
 Opened = TypeVar("Opened", bound="Device")
 
@@ -99,8 +100,20 @@ class CameraSettings:
 
     exposure: Annotated[float, quantity("s", positive=True)]
     region: Region | None = None  # None: the whole sensor
-    pixel_format: str = "Mono12"  # name of the GenICam pixel format: Mono8, Mono10, Mono12, Mono16
+    pixel_format: str = "Mono12"  # name of the GenICam pixel format: Mono8, BayerRG12, …
     gain: Annotated[float, quantity("dB")] = 0.0
+    black_level: Annotated[float | None, quantity(optional=True)] = None  # None: the camera's own
+    binning: Annotated[int, whole(1, 16)] = 1  # pixels joined along each axis; `region` counts them
+
+    @property
+    def bayer(self) -> Pattern | None:
+        """Bayer pattern of the region, from its first pixel; None for grey formats.
+
+        The format's name is that of the whole sensor: an odd row or column shifts the pattern.
+        """
+        every = [one for one in PATTERNS if self.pixel_format.startswith(f"Bayer{one[:2]}")]
+        top, left = (self.region.top, self.region.left) if self.region else (0, 0)
+        return shifted_pattern(every[0], top, left) if every else None
 
 
 @dataclass(frozen=True)

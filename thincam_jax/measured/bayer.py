@@ -11,7 +11,8 @@ from thincam_jax._core.arguments import checked
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 Demosaicing = Literal["bilinear", "superpixel"]
-PATTERNS, METHODS = get_args(Pattern), get_args(Demosaicing)
+PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
+METHODS = get_args(Demosaicing)
 
 # Weights of the samples around a pixel: for a colour at one site in four, or two in four as green,
 # these interpolate linearly between the nearest samples.
@@ -48,28 +49,21 @@ def demosaic(
 
     **Errors**: ValueError for an unknown pattern or method and for odd sizes of "superpixel".
     """
-    sites = colour_sites(mosaic.shape, pattern)
     values = mosaic if mosaic.dtype == np.float64 else mosaic.astype(np.float32)
-    channels = []
+    return demosaiced(values, pattern, method, known, 1)
+
+
+def demosaiced(
+    values: np.ndarray, pattern: Pattern, method: Demosaicing, known: np.ndarray | None, power: int
+) -> np.ndarray:
+    """`demosaic`, or with a power of 2 of the weights the variance of what it makes of noise."""
+    sites, channels = colour_sites(values.shape, pattern), []
     for colour in "RGB":
         used = sites[colour] if known is None else sites[colour] & known
-        weight = _gather(used.astype(values.dtype), colour, method)
-        total = _gather(np.where(used, values, 0), colour, method)
+        weight = _gather(used.astype(values.dtype), colour, method) ** power
+        total = _gather(np.where(used, values, 0), colour, method, power)
         channels.append(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0))
     return np.stack(channels, axis=-1)
-
-
-def demosaic_variance(
-    variance: np.ndarray, pattern: Pattern, method: Demosaicing, known: np.ndarray | None = None
-) -> np.ndarray:
-    """Variance of the values of `demosaic` for pixels of independent noise of a `variance`."""
-    sites, found = colour_sites(variance.shape, pattern), []
-    for colour in "RGB":
-        used = (sites[colour] if known is None else sites[colour] & known).astype(variance.dtype)
-        weight = _gather(used, colour, method)
-        total = _gather(used * variance, colour, method, 2)
-        found.append(total / np.where(weight > 0, weight, 1) ** 2)
-    return np.stack(found, axis=-1)
 
 
 def shifted_pattern(pattern: Pattern, top: int, left: int) -> Pattern:

@@ -166,14 +166,6 @@ def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
                 f"the dark frame ({background.name}) has {_scale(background)} and the {name} "
                 f"{_scale(raw)}; read both with the same `bits`"
             )
-    elif isinstance(background, SensorCalibration):
-        sensor, shape = background, background.response.shape
-        if (shape, sensor.full_scale) != (raw.pixels.shape, raw.full_scale):
-            raise MeasurementError(
-                f"the sensor was measured with {shape} pixels to {sensor.full_scale} counts and "
-                f"the {name} has {raw.pixels.shape} to {raw.full_scale:g}; measure it with the "
-                "same region, binning and pixel format, and give `bits`"
-            )
     elif isinstance(background, str):
         if background != "corner":
             raise MeasurementError(
@@ -184,7 +176,7 @@ def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
                 f"the PSF has {_scale(psf)} and the {name} {_scale(raw)}, so the PSF's corner says "
                 "nothing about it; read both with the same `bits`, or give its background"
             )
-    elif not np.isfinite(background):
+    elif not isinstance(background, SensorCalibration) and not np.isfinite(background):
         raise MeasurementError(f"background = {background!r}: give a finite number of counts")
 
 

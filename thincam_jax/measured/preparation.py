@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
-from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaic_variance
+from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaiced
 from thincam_jax.measured.options import Centre, Preparation, check_match
 from thincam_jax.measured.preparation_log import Centring, CleanUp, ImageLog, PreparationLog
 from thincam_jax.measured.raw import MeasurementError, Raw
@@ -28,8 +28,8 @@ class Prepared:
     - `capture`: in fractions of full scale divided by `log.capture_divisor`.
     - `valid`: False where the capture is saturated or dead.
     - `log`: what the steps did.
-    - `variance`: of the capture, where a sensor's calibration is its background; infinite where not
-      valid. That values interpolated by "bilinear" are correlated is left out of block means.
+    - `variance`: of the capture, by a sensor's calibration; infinite where it is not valid. Block
+      means of values that "bilinear" interpolated are taken as independent.
     """
 
     psf: Float32[np.ndarray, "psf_channel k l"]
@@ -101,7 +101,6 @@ def prepare(
     raws = {"psf": psf, "capture": capture}
     check_match(psf, capture, backgrounds, dead, options)
     planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
-    saturated = {name: _saturated(raw, planes[name], options) for name, raw in raws.items()}
     square = slice(None), slice(*options.corner), slice(*options.corner)
     corner = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     corner = corner.astype(np.float32)
@@ -111,12 +110,9 @@ def prepare(
     levels = {n: _level(b, raws[n], corners[n]) for n, b in backgrounds.items()}
     good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
     frames = {
-        n: _Frame(p - levels[n], saturated[n], _known(good, p.shape), np.zeros_like(p))
-        for n, p in planes.items()
+        n: _frame(raw, backgrounds[n], levels[n], _known(good, planes[n].shape), options)
+        for n, raw in raws.items()
     }
-    for n, background in backgrounds.items():
-        if isinstance(background, SensorCalibration):
-            frames[n] = _corrected(frames[n], raws[n], background)
     noise = _noise(frames["psf"].values[square].astype(np.float64), options)
     logs = {n: _image_log(raws[n], backgrounds[n], levels[n], f) for n, f in frames.items()}
     frames = {n: replace(f, values=np.maximum(f.values, 0)) for n, f in frames.items()}
@@ -142,8 +138,7 @@ def prepare(
     valid = frames["capture"].known & ~frames["capture"].saturated
     variance = None
     if isinstance(background, SensorCalibration):
-        variance = np.where(valid, frames["capture"].variance / divisor**2, np.inf)
-        variance = variance.astype(np.float32)
+        variance = np.where(valid, frames["capture"].variance / np.float32(divisor**2), np.inf)
     log = PreparationLog(
         options=options,
         psf=logs["psf"],
@@ -190,12 +185,17 @@ def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Fram
     )
 
 
-def _corrected(frame: _Frame, raw: Raw, sensor: SensorCalibration) -> _Frame:
-    """The frame in counts of pixels of equal response, with their variance."""
-    light, variance = (one[None].astype(np.float32) for one in sensor.correct(raw.pixels))
-    known = frame.known & ~sensor.defective
-    scale = raw.full_scale
-    return _Frame(light / scale, frame.saturated, known, variance / scale**2)
+def _frame(
+    raw: Raw, background: Background, level: np.ndarray, good: np.ndarray, options: Preparation
+) -> _Frame:
+    """An image without its background."""
+    plane = _in_full_scale(raw)
+    saturated = _saturated(raw, plane, options)
+    if not isinstance(background, SensorCalibration):
+        return _Frame(plane - level, saturated, good, np.zeros_like(plane))
+    light, variance = (one[None].astype(np.float32) for one in background.correct(raw))
+    scale = np.float32(raw.full_scale)
+    return _Frame(light / scale, saturated, good & ~background.defective, variance / scale**2)
 
 
 def _in_full_scale(raw: Raw) -> np.ndarray:
@@ -242,7 +242,7 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
     if frame.saturated.any():
         saturated = demosaic_mask(frame.saturated[0], pattern, method)
     has = ~nothing if known is None else demosaic_mask(known, pattern, method)
-    variance = demosaic_variance(frame.variance[0], pattern, method, known)
+    variance = demosaiced(frame.variance[0], pattern, method, known, 2)
     planes = colours, saturated, has, variance
     return _Frame(*(np.moveaxis(plane, -1, 0) for plane in planes))
 
@@ -283,8 +283,7 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
         for plane in planes
     ]
     light = np.maximum(np.stack(values), 0).astype(frame.values.dtype)
-    zeros = np.zeros_like(light)
-    return _Frame(light, zeros > 0, zeros == 0, zeros)
+    return _Frame(light, light < 0, light >= 0, 0 * light)
 
 
 def _downsampled(
@@ -305,14 +304,13 @@ def _means(frame: _Frame, factor: int) -> _Frame:
     """Means of the known pixels of each block, summed in float64; 0 where none is known."""
     kept = central_blocks(frame.values.shape[1:], factor)
     values, saturated, known, variance = (plane[:, *kept] for plane in vars(frame).values())
-    total = block_sum(np.where(known, values, 0), factor, np.float64)
-    count = block_sum(known, factor)
-    means = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
-    spread = block_sum(np.where(known, variance, 0), factor, np.float64) / np.maximum(count, 1) ** 2
-    kind = values.dtype
-    return _Frame(
-        means.astype(kind), block_sum(saturated, factor) > 0, count > 0, spread.astype(kind)
+    total, spread = (
+        block_sum(np.where(known, one, 0), factor, np.float64) for one in (values, variance)
     )
+    count = block_sum(known, factor)
+    means, spread = total / np.maximum(count, 1), spread / np.maximum(count, 1) ** 2
+    saturated = block_sum(saturated, factor) > 0
+    return _Frame(means.astype(values.dtype), saturated, count > 0, spread.astype(values.dtype))
 
 
 def _filled(frame: _Frame, name: str) -> np.ndarray:

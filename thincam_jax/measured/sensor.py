@@ -19,19 +19,18 @@ from pathlib import Path
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float, Real
+from jaxtyping import Bool, Float
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import MeasurementError, read_arrays, write_whole
 from thincam_jax._core.text import of_error
 from thincam_jax.measured.exposures import ExposedFrames
+from thincam_jax.measured.raw import Raw
 
 _ROUNDING = 1 / 12  # variance of whole counts
 _BRIGHTEST = 0.8  # of full scale
 _FEW = 0.01  # share of the pixels that may be brighter, and of dark counts that may be 0
-
 _PLACES = tuple(np.s_[i::2, j::2] for i in (0, 1) for j in (0, 1))  # of a Bayer pattern
-_SURE = 4.0  # standard errors of the conversion gain that it has to be
 
 
 @checked
@@ -40,24 +39,22 @@ class SensorCalibration:
     """A sensor's dark level, response and noise, as `measure_sensor` finds them.
 
     - `exposure`: s, of the frames that it corrects; see `at`.
-    - `dark_level`, `dark_rate`: b, counts; r, counts/s, None where all dark frames have one
-      exposure. `response`: f, 0 in defective pixels.
+    - `dark_level`, `dark_rate`: b, counts; r, counts/s, without error where all dark frames have
+      one exposure. `response`: f, 0 in defective pixels.
     - `defective`: pixels that are hot, dead, or unlike their neighbours in level or noise.
-    - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; with one exposure, with
+    - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; without a rate, with
       that of the dark current.
-    - `full_scale`: largest count.
-    - `photon_transfer`: mean light, counts, additional variance and its standard error, counts², of
-      each level.
+    - `photon_transfer`: of each level, mean light, counts, additional variance and its error.
     - names with `_error`: standard errors.
 
     It holds for the camera's gain, black level, pixel format, binning and region.
-
-    **Errors**: MeasurementError for maps of several shapes, and for no gain or response.
     """
 
     exposure: float
     dark_level: Float[np.ndarray, "y x"]
     dark_level_error: Float[np.ndarray, "y x"]
+    dark_rate: Float[np.ndarray, "y x"]
+    dark_rate_error: Float[np.ndarray, "y x"]
     response: Float[np.ndarray, "y x"]
     response_error: Float[np.ndarray, "y x"]
     defective: Bool[np.ndarray, "y x"]
@@ -67,80 +64,63 @@ class SensorCalibration:
     read_noise_error: float
     full_scale: int
     photon_transfer: Float[np.ndarray, "level 3"]
-    dark_rate: Float[np.ndarray, "y x"] | None = None
-    dark_rate_error: Float[np.ndarray, "y x"] | None = None
 
     def __post_init__(self):
-        every = {name: np.shape(one) for name, one in vars(self).items()}
-        shapes = {n for name, n in every.items() if len(n) == 2 and name != "photon_transfer"}
-        if len(shapes) > 1 or (self.dark_rate is None) != (self.dark_rate_error is None):
-            raise MeasurementError(f"maps of the shapes {shapes}; give all for the same pixels")
-        sound = (self.response > 0) | self.defective
-        if not (sound.all() and min(self.exposure, self.conversion_gain, self.full_scale) > 0):
-            raise MeasurementError("a response or gain is not above 0; measure the sensor again")
+        maps = [one for one in vars(self).values() if np.ndim(one) == 2]
+        shapes = {one.shape for one in maps} - {self.photon_transfer.shape}
+        lit = len(shapes) == 1 and bool(np.all((self.response > 0) | self.defective))
+        if not (lit and min(self.exposure, self.conversion_gain) > 0):
+            raise MeasurementError(f"maps of {shapes}, no gain or no response; measure it again")
 
     def at(self, exposure: float) -> "SensorCalibration":
-        """Calibration for frames of another exposure, s.
-
-        **Errors**: MeasurementError where all dark frames have one exposure.
-        """
+        """Calibration for frames of another exposure, s; MeasurementError without a dark rate."""
         later = exposure - self.exposure
-        if self.dark_rate is None or self.dark_rate_error is None:
-            if abs(later) > 1e-3 * self.exposure:
-                raise MeasurementError(
-                    f"all dark frames have {self.exposure:g} s and the frame has {exposure:g} s; "
-                    "measure the sensor with dark frames of a second exposure"
-                )
-            return self
+        if not self.dark_rate_error.any() and abs(later) > 1e-3 * self.exposure:
+            raise MeasurementError(
+                f"all dark frames have {self.exposure:g} s and the frame has {exposure:g} s; "
+                "measure the sensor with dark frames of a second exposure"
+            )
         error = np.hypot(self.dark_level_error, self.dark_rate_error * later)
         level = self.dark_level + self.dark_rate * later
         return replace(self, exposure=exposure, dark_level=level, dark_level_error=error)
 
-    def correct(
-        self, counts: Real[np.ndarray, "y x"]
-    ) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
+    def correct(self, raw: Raw) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
         """Light u of a frame, counts, and its variance; both 0 in defective pixels.
 
-        The variance is that of photon noise, estimated from the pixel's own count, of read noise,
-        and of the calibration.
-
-        **Errors**: MeasurementError for other pixels.
+        The variance is that of photon noise, by the pixel's own count, of read noise, and of the
+        calibration. MeasurementError for other pixels or another full scale.
         """
-        if counts.shape != self.response.shape:
+        known = self.response.shape, self.full_scale
+        given = raw.pixels.shape, int(raw.full_scale)
+        if known != given:
             raise MeasurementError(
-                f"the sensor was measured with {self.response.shape} pixels and the frame has "
-                f"{counts.shape}; measure it with the frame's region and binning"
+                f"the sensor was measured with (pixels, full scale) {known}, and {raw.name} has "
+                f"{given}; give frames of the same region, binning and pixel format, and `bits`"
             )
-        light, gain = counts - self.dark_level, self.conversion_gain
+        light, gain = raw.pixels - self.dark_level, self.conversion_gain
         response = np.where(self.defective, 1, self.response)
-        current = 0.0 if self.dark_rate is None else self.dark_rate * self.exposure
-        variance = (gain * self.read_noise) ** 2 + _ROUNDING + gain * np.maximum(light + current, 0)
-        variance = variance + self.dark_level_error**2
-        variance = variance + (light * self.response_error / response) ** 2
+        photons = gain * np.maximum(light + self.dark_rate * self.exposure, 0)
+        variance = photons + (gain * self.read_noise) ** 2 + _ROUNDING
+        variance += self.dark_level_error**2 + (light * self.response_error / response) ** 2
         return ~self.defective * light / response, ~self.defective * variance / response**2
 
     def save(self, path: str | Path) -> Path:
         """Write it to one file, .npz."""
         file = io.BytesIO()
-        np.savez(file, **{name: one for name, one in vars(self).items() if one is not None})
+        np.savez(file, **vars(self))
         return write_whole(path, file.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> "SensorCalibration":
-        """Read what `save` has written.
-
-        **Errors**: MeasurementError, one line, for a damaged file or another one.
-        """
+        """Read what `save` has written; MeasurementError, one line, for any other file."""
         try:
             found = read_arrays(path)
             return cls(**{name: one if one.ndim else one.item() for name, one in found.items()})
         except OSError:
             raise
         except Exception as error:  # of many kinds, as NumPy takes the headers for Python
-            raise MeasurementError(
-                f"{path} is no calibration of a sensor ({of_error(error)}); measure it again, and "
-                "save it under this name"
-            ) from error
+            cause = f"{path} is no calibration of a sensor ({of_error(error)})"
+            raise MeasurementError(f"{cause}; measure it again and save it so") from error
 
 
 @checked
@@ -153,20 +133,17 @@ def measure_sensor(
 ) -> SensorCalibration:
     r"""Measure a sensor with frames of an evenly lit surface and dark frames.
 
-    - `series`: one exposure or more; several show the dark current, and the line of photon
-      transfer. `Acquisition.exposed` reads them from a rig's store.
+    - `series`: one exposure or more, as `Acquisition.exposed` reads them from a rig's store;
+      several show the dark current, and the line of photon transfer.
     - `outlier`: difference from the neighbours, in standard deviations, of a defective pixel.
     - `mosaic`: of a Bayer pattern: the mean response is 1 at each of its four places, so that the
       colour of the light has no effect.
 
     With the means :math:`Y_j` of light over all good pixels, and :math:`V_j` of the variance of lit
-    minus that of dark frames, the slope is :math:`K = \sum_j w_j V_j / \sum_j w_j Y_j`, unbiased
-    for any weights. The scatter over the pixels gives the errors, whatever the noise's
-    distribution. Exposures at which more than 1 % of the pixels exceed 0.8 of full scale are used
-    for the dark level only. Unevenness of the light counts as response.
-
-    **Errors**: MeasurementError for no exposures, frames of other pixels, a black level that is too
-    low, light that is too bright, and light without photon noise.
+    minus that of dark frames, :math:`K = \sum_j w_j V_j / \sum_j w_j Y_j`, unbiased for any
+    weights; the scatter over the pixels gives the errors. Exposures at which over 1 % of the pixels
+    exceed 0.8 of full scale are used for the dark level only. Unevenness of the light counts as
+    response. MeasurementError for frames that do not fit together, are too bright, or too dark.
 
     >>> random = np.random.default_rng(0)
     >>> def taken(exposure):
@@ -190,8 +167,8 @@ def measure_sensor(
     # Weights of the dark means that give the line of each pixel, and of the variances.
     middle, degrees = float(darks @ times / darks.sum()), darks - 1
     moment = darks * (times - middle)
-    has_rate = bool(moment @ times > 1e-6 * darks.sum() * middle**2)
-    line = np.stack([darks / darks.sum(), has_rate * moment / (moment @ times or 1.0)])
+    spread = moment @ times if np.ptp(times) > 1e-3 * middle else np.inf
+    line = np.stack([darks / darks.sum(), moment / spread])
     level, rate = np.tensordot(line, dark, 1)
     noise = np.tensordot(degrees / degrees.sum(), dark_variance, 1)
     counted = used * frames
@@ -210,9 +187,8 @@ def measure_sensor(
     if not (scale > 0).all():
         raise MeasurementError("the frames are no brighter than the dark ones; give more light")
 
-    gain, in_gain, points = _photon_transfer(
-        light[used][:, good], (variance - dark_variance)[used][:, good]
-    )
+    excess = (variance - dark_variance)[used][:, good]
+    gain, in_gain, points = _photon_transfer(light[used][:, good], excess)
     # What each pixel adds to the errors: of the read noise's variance, then of it in electrons.
     current = rate[good] * (degrees @ times / degrees.sum())
     read = noise[good] - gain * current - _ROUNDING
@@ -223,45 +199,24 @@ def measure_sensor(
     constant = max(float(read.mean()), 0.0) + _ROUNDING
     of_dark = np.maximum(constant + gain * np.multiply.outer(times, rate), _ROUNDING)
     of_light = np.maximum(of_dark + gain * light, _ROUNDING)
-    of_total = np.tensordot(counted, of_light, 1) + np.tensordot(
-        counted * frames / darks, of_dark, 1
-    )
-    errors = np.sqrt(np.tensordot(line**2 / darks, of_dark, 1))
-    maps = {
-        "dark_level": level,
-        "dark_level_error": errors[0],
-        "response": good * total / scale,
-        "response_error": good * np.sqrt(of_total) / scale,
-    }
-    if has_rate:
-        maps |= {"dark_rate": rate, "dark_rate_error": errors[1]}
-    return SensorCalibration(
-        exposure=middle,
-        **{name: one.astype(np.float32) for name, one in maps.items()},
-        defective=odd,
-        conversion_gain=gain,
-        conversion_gain_error=float(np.linalg.norm(in_gain)),
-        read_noise=float(np.sqrt(max(read.mean(), 0.0)) / gain),
-        read_noise_error=float(np.linalg.norm(in_electrons)),
-        full_scale=full_scale,
-        photon_transfer=points,
-    )
+    of_light += of_dark * (frames / darks)[:, None, None]
+    variances = *np.tensordot(line**2 / darks, of_dark, 1), np.tensordot(counted, of_light, 1)
+    errors = np.sqrt(np.stack(variances, dtype=np.float32))
+    maps = level, errors[0], rate, errors[1], good * total / scale, good * errors[2] / scale
+    found = gain, np.linalg.norm(in_gain), np.sqrt(max(read.mean(), 0.0)) / gain
+    numbers = map(float, (*found, np.linalg.norm(in_electrons)))
+    single = (one.astype(np.float32) for one in maps)
+    return SensorCalibration(middle, *single, odd, *numbers, full_scale, points)
 
 
 def _moments(one: ExposedFrames) -> tuple[np.ndarray, ...]:
     """Maps of the dark mean and variance, of the light's mean and variance, and of the maximum."""
     dark = one.dark.mean(axis=0, dtype=float)
     light = one.frames.mean(axis=0, dtype=float) - dark
-    highest = np.maximum(one.frames.max(axis=0), one.dark.max(axis=0))
     # A lamp's flicker changes all pixels in proportion to their light, and is no noise.
-    profile = light / (light.mean() or 1.0)
-    return (
-        dark,
-        _variance(one.dark, np.ones_like(dark)),
-        light,
-        _variance(one.frames, profile),
-        highest,
-    )
+    variance = _variance(one.frames, light / (light.mean() or 1.0))
+    highest = np.maximum(one.frames.max(axis=0), one.dark.max(axis=0))
+    return dark, _variance(one.dark, np.ones_like(dark)), light, variance, highest
 
 
 def _variance(frames: np.ndarray, profile: np.ndarray) -> np.ndarray:
@@ -273,10 +228,7 @@ def _variance(frames: np.ndarray, profile: np.ndarray) -> np.ndarray:
 
 
 def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """K, what each pixel adds to its error, and the points of the line (level, 3).
-
-    - `light`, `excess`: mean and additional variance (level, pixel).
-    """
+    """K, what each pixel adds to its error, and the line's points, of maps (level, pixel)."""
     means, weights = light.mean(axis=1), np.ones(len(light))
     for _ in range(2):  # the second time weighted by what the first leaves
         gain = float(weights @ excess.mean(axis=1) / (weights @ means))
@@ -284,20 +236,17 @@ def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.n
         scatter = residual.var(axis=1)
         in_gain = weights @ residual / (weights @ means) / light.shape[1]
         weights = means / np.maximum(scatter, _ROUNDING)
-    if not gain > _SURE * np.linalg.norm(in_gain):
+    if not gain > 4 * np.linalg.norm(in_gain):
         raise MeasurementError("the variance does not grow with the light; give raw frames")
     points = means, excess.mean(axis=1), np.sqrt(scatter / light.shape[1])
     return gain, in_gain, np.stack(points, axis=1)
 
 
 def _stands_out(values: np.ndarray, outlier: float, error: float) -> np.ndarray:
-    """Pixels that differ from the median of their 5×5 neighbours of one colour.
-
-    - `error`: least standard deviation of the values.
-    """
+    """Pixels unlike the median of their 5×5 neighbours of one colour; `error`: least deviation."""
     found = np.zeros(values.shape, bool)
     for place in _PLACES:
         difference = np.abs(values[place] - scipy.ndimage.median_filter(values[place], 5))
-        spread = 1.4826 * float(np.median(difference))
-        found[place] = difference > outlier * max(spread, error)
+        spread = max(1.4826 * float(np.median(difference)), error)
+        found[place] = difference > outlier * spread
     return found

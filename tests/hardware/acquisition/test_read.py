@@ -9,13 +9,17 @@ import time
 import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hardware.memory_rig import World, by_rows, fiducial_plan
 
 from thincam_jax._core.capture_store import CaptureStoreError
+from thincam_jax.hardware import CameraSettings, Region, open_rig
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.plan import canonical_json
+from thincam_jax.hardware.acquisition.plan import WHITE, Plan, canonical_json, scene
 from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.virtual import Electronics, VirtualRig
+from thincam_jax.measured import Preparation, measure_sensor, prepare
 from thincam_jax.measured.calibration import open_captures
 
 PLAN = by_rows(fiducial_plan(4, dark_every=2))
@@ -184,3 +188,75 @@ def test_a_store_that_harms_is_refused(harm, store, tmp_path, little):
         refused += [told] if told else []
         assert len(told.splitlines()) < 2 and len(told) < 1000, told
     assert refused
+
+
+class Coloured:
+    """Even light in three colours on a sensor whose first pixels are red and green."""
+
+    sensor_shape = (40, 56)
+    colours = (6e4, 4e4, 1e4)  # electrons/s of red, green and blue
+
+    def __call__(self, shown, position):
+        light = np.zeros(self.sensor_shape, np.float32)
+        for (row, column), colour in zip(np.ndindex(2, 2), (0, 1, 1, 2), strict=True):
+            light[row::2, column::2] = self.colours[colour]
+        return light * bool(shown.any())
+
+
+@pytest.mark.parametrize(
+    ("driver", "corner", "pixel_format", "pattern"),
+    [
+        ("usb3_vision", (8, 4), "BayerRG8", "RGGB"),
+        ("usb3_vision", (8, 4), "BayerRG12p", "RGGB"),
+        ("pylon", (8, 4), "BayerRG12", "RGGB"),
+        ("pylon", (8, 5), "BayerRG12", "GRBG"),
+        ("pylon", (7, 4), "BayerRG12", "GBRG"),
+        ("pylon", (7, 5), "BayerRG12", "BGGR"),
+    ],
+)
+def test_colours_are_those_of_the_scene_wherever_the_region_begins(
+    tmp_path, driver, corner, pixel_format, pattern
+):
+    settings = CameraSettings(0.1, Region(*corner, 24, 32), pixel_format)
+    virtual = VirtualRig(Coloured(), display_shape=(8, 8))
+    drivers = {"camera": (driver, {}), "display": ("sdl", {})}
+    plan = scene(WHITE, settings, frames=2, dark_frames=2)
+    with open_rig(drivers, 1.0, virtual) as rig:
+        assert acquire(plan, rig, tmp_path / "store").complete
+    found = read_acquisition(tmp_path / "store")
+    assert found.bayer == pattern and found.settings[0].pixel_format == pixel_format
+    raw, dark = found.raw(0), found.raw(2)
+    options = Preparation(bayer=found.bayer, capture_scale="none", corner=(1, 9))
+    ready = prepare(raw, raw, dark, options)
+    counts = raw.full_scale * ready.capture.mean(axis=(1, 2))
+    electron = Electronics().scale(settings)[0]
+    np.testing.assert_allclose(counts, 0.1 * electron * np.array(Coloured.colours), rtol=0.02)
+
+
+def test_a_sensor_is_measured_from_a_store(tmp_path):
+    """The virtual camera's own numbers, by a plan of a scene."""
+    virtual = VirtualRig(Coloured(), display_shape=(8, 8))
+    drivers = {"camera": ("usb3_vision", {}), "display": ("sdl", {})}
+    given = {"exposures": (0.02, 0.05, 0.1), "frames": 6, "dark_frames": 6}
+    plan = scene(WHITE, CameraSettings(0.1, pixel_format="BayerRG12"), **given)
+    with open_rig(drivers, 1.0, virtual) as rig:
+        acquire(plan, rig, tmp_path / "store")
+    found = read_acquisition(tmp_path / "store")
+    sensor = measure_sensor(found.exposed(), 2**found.bits - 1, mosaic=True)
+    truth = Electronics()
+    electron = truth.scale(found.settings[0])[0]
+    assert abs(sensor.conversion_gain - electron) < 4 * sensor.conversion_gain_error
+    assert abs(sensor.read_noise - truth.read_noise) < 4 * sensor.read_noise_error
+    assert np.mean(sensor.dark_level) == pytest.approx(truth.offset, abs=0.1)
+    assert sensor.response.mean() == pytest.approx(1, abs=1e-3)
+    assert sensor.defective.mean() < 1e-3
+
+
+def test_hashes_of_plans_stay_as_they_were(tmp_path):
+    """Settings that came later are in a plan only where they are given: stores can be read."""
+    plan = scene(WHITE, CameraSettings(0.1, Region(1, 2, 3, 4)))
+    assert '"black_level"' not in plan.as_json() and '"binning"' not in plan.as_json()
+    assert Plan.from_json(plan.as_json()) == plan
+    assert plan.hash.startswith("d92cc4a7cc32bbd7")
+    other = scene(WHITE, CameraSettings(0.1, black_level=64.0, binning=2))
+    assert Plan.from_json(other.as_json()).settings == other.settings

@@ -15,6 +15,7 @@ from thincam_jax.hardware import (
 )
 from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
+from thincam_jax.hardware.virtual.rig import bits_of
 
 SENSOR = 24, 40
 SETTINGS = CameraSettings(exposure=1e-3, region=Region(4, 8, 12, 20))
@@ -28,7 +29,7 @@ class Scene:
         self.random, self.shown = np.random.default_rng(5), np.zeros(0)
 
     def expose(self, settings: CameraSettings) -> np.ndarray:
-        region, bits = settings.region, int(settings.pixel_format.removeprefix("Mono"))
+        region, bits = settings.region, bits_of(settings)
         assert region is not None
         shape = region.height, region.width
         self.shown = self.random.integers(0, 2**bits, shape).astype(np.uint16)
@@ -68,7 +69,10 @@ def test_the_vendors_emulator_says_what_it_is_set_to(monkeypatch):
         assert frames[0].exposure == actual.exposure
 
 
-@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono10", "Mono12", "Mono16"])
+@pytest.mark.parametrize(
+    "pixel_format",
+    [f"{colour}{bits}" for colour in ("Mono", "BayerRG", "BayerGB") for bits in (8, 10, 12, 16)],
+)
 def test_frames_are_exact(camera, scene, pixel_format):
     camera.configure(CameraSettings(1e-3, SETTINGS.region, pixel_format))
     frames, shown = [], []
@@ -77,7 +81,31 @@ def test_frames_are_exact(camera, scene, pixel_format):
         shown.append(scene.shown)
     for frame, counts in zip(frames, shown, strict=True):  # each has memory of its own
         assert np.array_equal(frame.pixels, counts)
-    assert f"Mono{frames[0].bit_depth}" == pixel_format
+    assert pixel_format.endswith(str(frames[0].bit_depth))
+
+
+def test_binning_and_black_level_are_set_and_read_back(camera, scene):
+    taken = camera.configure(CameraSettings(1e-3, binning=2, black_level=64.0))
+    assert (taken.binning, taken.black_level) == (2, pytest.approx(64.0, abs=1.0))
+    assert taken.region == Region(0, 0, 12, 20)
+    assert np.array_equal(camera.trigger_and_grab(TIMEOUT).pixels, scene.shown)
+    with pytest.raises(OutOfRange, match="a part of 12 × 20"):
+        camera.configure(CameraSettings(1e-3, Region(0, 0, 24, 40), binning=2))
+    assert camera.configure(CameraSettings(1e-3, Region(0, 0, 24, 40))).binning == 1
+    assert camera.configure(CameraSettings(1e-3)).black_level == taken.black_level  # left as it is
+
+
+def test_a_camera_that_renames_its_format_at_an_odd_place_is_seen(camera, monkeypatch):
+    def renamed(name):
+        odd = name == "PixelFormat" and camera._features.get("OffsetX") % 2
+        return "BayerGR12" if odd else plain(name)
+
+    plain = camera._features.get
+    monkeypatch.setattr(camera._features, "get", renamed)
+    even = CameraSettings(1e-3, Region(2, 4, 8, 12), "BayerRG12")
+    assert camera.configure(even).bayer == "RGGB"
+    with pytest.raises(OutOfRange, match="its format is BayerGR12; give an even top and left"):
+        camera.configure(CameraSettings(1e-3, Region(2, 5, 8, 12), "BayerRG12"))
 
 
 def test_without_a_region_the_whole_sensor(camera):
@@ -91,7 +119,10 @@ def test_without_a_region_the_whole_sensor(camera):
         (CameraSettings(100.0), "1e-06 … 10 s"),
         (CameraSettings(1e-3, Region(0, 0, 25, 40)), "24 × 40"),
         (CameraSettings(1e-3, Region(0, 39, 2, 2)), "24 × 40"),
-        (CameraSettings(1e-3, pixel_format="RGB8"), "Mono8, Mono10, Mono12, Mono16"),
+        (CameraSettings(1e-3, pixel_format="RGB8"), "Mono8, Mono10, Mono12, Mono16, BayerGR8"),
+        (CameraSettings(1e-3, binning=5), "BinningHorizontal of 5; give 1 … 4"),
+        (CameraSettings(1e-3, black_level=2e3), "BlackLevel of 2000; give 0 … 1023"),
+        (CameraSettings(1e-3, pixel_format="BayerRG8", binning=2), "give binning 1"),
         (CameraSettings(1e-3, gain=100.0), "0 … 48 dB"),
     ],
 )

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # it brings JAX
     from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 FRINGE_SCAN = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)  # phases, rad
+_NEW_DEFAULTS = ("black_level", None), ("binning", 1)
 PHASE_PAIR = (0.0, 1.5 * math.pi)
 
 
@@ -132,7 +133,11 @@ class Plan:
         plan = {
             "name": self.name,
             "patterns": [[p.kind, dict(p.numbers)] for p in self.patterns],
-            "settings": [dataclasses.asdict(s) for s in self.settings],
+            # Without what older plans do not have, so that their hashes stay.
+            "settings": [
+                {k: v for k, v in dataclasses.asdict(s).items() if (k, v) not in _NEW_DEFAULTS}
+                for s in self.settings
+            ],
             "steps": [[s.pattern, s.position, s.settings, s.dark] for s in self.steps],
             "facts": dict(self.facts),
         }

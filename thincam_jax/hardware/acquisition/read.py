@@ -14,7 +14,9 @@ from thincam_jax.hardware.acquisition.journal import frame_records, read_journal
 from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
 from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.measured import bayer
 from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge_exposures
+from thincam_jax.measured.raw import Raw
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,15 @@ class Acquisition:
         return slice(top, top + rows), slice(left, left + columns)
 
     @property
+    def bayer(self) -> bayer.Pattern | None:
+        """Bayer pattern of the frames, for `Preparation` and `demosaic`; None for grey ones."""
+        return self.settings[0].bayer
+
+    def raw(self, step: int) -> Raw:
+        """Frame of a step as `prepare` takes it."""
+        return Raw(self.frame(step), self.bits, name=f"frame {step} of {self.path}")
+
+    @property
     def distances(self) -> list[float | None]:
         """Stage position plus the plan's `stage_zero`, mm, for each capture."""
         zero = self.plan.facts.get("stage_zero", 0.0)
@@ -70,14 +81,16 @@ class Acquisition:
 
     def dark(self, settings: int = 0) -> np.ndarray | None:
         """Mean of the dark frames with the settings of that number, (y, x) counts."""
-        steps = enumerate(self.plan.steps)
-        numbers = [n for n, step in steps if step.dark and step.settings == settings]
-        if not numbers:
+        if not (numbers := self._steps(settings, True)):
             return None
         total = np.zeros(self.sensor_shape)
         for number in numbers:
             total += self.frame(number)
         return (total / len(numbers)).astype(np.float32)
+
+    def _steps(self, settings: int, dark: bool) -> list[int]:
+        steps = enumerate(self.plan.steps)
+        return [n for n, step in steps if (step.settings, step.dark) == (settings, dark)]
 
     def captures(self) -> np.ndarray:
         """All captures (capture, y, x) in counts, float32, minus the mean dark frame."""
@@ -90,21 +103,21 @@ class Acquisition:
                 found[place] -= offset
         return found
 
+    def exposed(self) -> list[ExposedFrames]:
+        """Frames and dark frames of each exposure; ValueError for fewer than two of either."""
+
+        def frames(number: int, dark: bool) -> np.ndarray:
+            found = [self.frame(step) for step in self._steps(number, dark)]
+            return np.reshape(found, (-1, *self.sensor_shape))
+
+        return [
+            ExposedFrames(one.exposure, frames(number, False), frames(number, True))
+            for number, one in enumerate(self.settings)
+        ]
+
     def merged(self) -> MergedExposures:
         """One linear image, counts per second, of a scene's frames; see `merge_exposures`."""
-
-        def frames(settings: int, dark: bool) -> np.ndarray:
-            steps = enumerate(self.plan.steps)
-            numbers = [n for n, s in steps if (s.settings, s.dark) == (settings, dark)]
-            return np.array([self.frame(number) for number in numbers])
-
-        return merge_exposures(
-            [
-                ExposedFrames(one.exposure, frames(number, False), frames(number, True))
-                for number, one in enumerate(self.settings)
-            ],
-            2**self.bits - 1,
-        )
+        return merge_exposures(self.exposed(), 2**self.bits - 1)
 
     def scene(self) -> tuple[np.ndarray, np.ndarray | None]:
         """One frame (1, y, x) of a scene, and its variance (y, x), in counts of the first exposure.

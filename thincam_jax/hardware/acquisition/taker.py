@@ -289,8 +289,10 @@ def full_scale(frame: Frame) -> int:
 
 def _same(first: CameraSettings, second: CameraSettings) -> bool:
     """Whether two settings agree up to the rounding of registers."""
+    numbers = zip(*((one.gain, one.black_level or 0.0) for one in (first, second)), strict=True)
+    exact = {(one.region, one.pixel_format, one.binning) for one in (first, second)}
     return (
-        (first.region, first.pixel_format) == (second.region, second.pixel_format)
+        len(exact) == 1
         and math.isclose(first.exposure, second.exposure, rel_tol=1e-4)
-        and math.isclose(first.gain, second.gain, abs_tol=1e-3)
+        and all(math.isclose(*pair, abs_tol=1e-3) for pair in numbers)
     )

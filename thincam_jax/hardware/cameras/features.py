@@ -11,9 +11,11 @@ from typing import Any, Protocol, runtime_checkable
 from thincam_jax.hardware.base import Camera, CameraSettings, Region
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
-BIT_DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
+COLOURS = "Mono", "BayerGR", "BayerRG", "BayerGB", "BayerBG"
+BIT_DEPTHS = {f"{colour}{bits}": bits for colour in COLOURS for bits in (8, 10, 12, 16)}
 Number = int | float
 Value = Number | str
+_BINNING = "BinningHorizontal", "BinningVertical"
 _MICROSECOND = 1e-6  # s; SFNC counts exposures in µs
 
 
@@ -68,11 +70,17 @@ class FeatureCamera(Camera):
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         self._stop()
-        shape = self.sensor_shape
+        rows, columns = self.sensor_shape
         with self._translated("configure"):
+            now = read(self._features).binning
+            shape = rows * now // settings.binning, columns * now // settings.binning
             self._require(settings, shape)
-            self._settings = _set_to(self._features, settings, shape)
-        return self._settings
+            taken = _set_to(self._features, settings, shape)
+            if taken.pixel_format != settings.pixel_format:
+                cause = f"at an odd row or column its format is {taken.pixel_format}"
+                raise OutOfRange(self._name, "configure", cause, "give an even top and left")
+        self._settings = taken
+        return taken
 
     def _require_settings(self) -> CameraSettings:
         if self._settings is None:
@@ -83,7 +91,7 @@ class FeatureCamera(Camera):
         return Timeout(self._name, operation, cause, "try again, or allow more time")
 
     def _require(self, asked: CameraSettings, shape: tuple[int, int]) -> None:
-        """OutOfRange for a region, format, exposure or gain that the camera does not support."""
+        """OutOfRange for a region, format or number that the camera does not support."""
 
         def refuse(what: str, allowed: str) -> OutOfRange:
             return OutOfRange(self._name, "configure", what, f"give {allowed}")
@@ -102,16 +110,22 @@ class FeatureCamera(Camera):
         for name, pixels in (("Width", region.width), ("Height", region.height)):
             if features.has(name) and pixels < (least := features.limits(name)[0]):
                 raise refuse(f"{name} of {pixels} pixels", f"at least {least}")
+        if asked.bayer and asked.binning > 1:
+            raise refuse(f"binning mixes the colours of {asked.pixel_format}", "binning 1")
         for name, given, unit, scale in (
-            (_exposure(features), asked.exposure, "s", _MICROSECOND),
-            ("Gain", asked.gain, "dB", 1.0),
+            (_exposure(features), asked.exposure, " s", _MICROSECOND),
+            ("Gain", asked.gain, " dB", 1.0),
+            ("BlackLevel", asked.black_level, "", 1.0),
+            *((name, asked.binning, "", 1.0) for name in _BINNING),
         ):
-            low, high = 0.0, 0.0  # a gain that is not in dB is left unchanged
+            if given is None:
+                continue
+            low = high = float(name in _BINNING)  # a gain that is not in dB is left unchanged
             if features.has(name):
                 low, high = (limit * scale for limit in features.limits(name)[:2])
             rounding = 1e-9 * abs(given)  # of a limit that was read in other units
             if not low - rounding <= given <= high + rounding:
-                raise refuse(f"{name} of {given:g} {unit}", f"{low:g} … {high:g} {unit}")
+                raise refuse(f"{name} of {given:g}{unit}", f"{low:g} … {high:g}{unit}")
 
 
 class FrameCount:
@@ -163,6 +177,7 @@ def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -
         if features.has(offset):
             _put(features, offset, features.limits(offset)[0])
     for name, pixels in (
+        *((name, asked.binning) for name in _BINNING),
         ("Width", region.width),
         ("Height", region.height),
         ("OffsetX", region.left),
@@ -173,6 +188,8 @@ def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -
     _put_within(features, _exposure(features), asked.exposure / _MICROSECOND)
     if features.has("Gain"):
         _put_within(features, "Gain", asked.gain)
+    if asked.black_level is not None and features.has("BlackLevel"):
+        _put_within(features, "BlackLevel", asked.black_level)
     return read(features)
 
 
@@ -185,7 +202,9 @@ def read(features: Features) -> CameraSettings:
     region = Region(pixels("OffsetY"), pixels("OffsetX"), pixels("Height"), pixels("Width"))
     gain = float(features.get("Gain")) if features.has("Gain") else 0.0
     exposure = float(features.get(_exposure(features))) * _MICROSECOND
-    return CameraSettings(exposure, region, str(features.get("PixelFormat")), gain)
+    level = float(features.get("BlackLevel")) if features.has("BlackLevel") else None
+    form, binning = str(features.get("PixelFormat")), pixels(_BINNING[0]) or 1
+    return CameraSettings(exposure, region, form, gain, level, binning)
 
 
 def _exposure(features: Features) -> str:

@@ -63,7 +63,9 @@ class VirtualPylonCamera(PylonCamera):
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
-        return self._sensor_shape
+        rows, columns = self._sensor_shape
+        binning = int(self._features.get("BinningVertical"))
+        return rows // binning, columns // binning
 
     def trigger_and_grab(self, timeout: float) -> Frame:
         if self._camera.IsGrabbing() and self._faults.due("stale_frame"):

@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.virtual.optics import Optics
@@ -144,6 +145,8 @@ class VirtualRig:
             number, shown = self._shown if settled else self._before
             state = number, round(1000 * self._position)
             electrons = settings.exposure * self._image(number, shown)
+            kept = central_blocks(electrons.shape, settings.binning)
+            electrons = block_sum(electrons[kept], settings.binning)
             exposure = self._exposures[state]
             self._exposures[state] += 1
         region = settings.region

@@ -316,9 +316,9 @@ class VirtualUsb3Vision(IBackend):
                 f"expose returned {counts.dtype} of shape {counts.shape}; it has to return uint16 "
                 f"of {(region.height, region.width)}"
             )
-        if settings.pixel_format == "Mono8":
+        if PIXEL_FORMATS[settings.pixel_format][1] == 8:
             counts = counts.astype(np.uint8)
-        elif settings.pixel_format == "Mono12p":
+        elif settings.pixel_format.endswith("p"):
             pairs = np.append(counts, np.zeros(counts.size % 2, np.uint16)).reshape(-1, 2)
             even, odd = pairs[:, 0], pairs[:, 1]
             counts = np.empty((len(pairs), 3), np.uint8)

@@ -8,6 +8,7 @@ import pytest
 from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
 from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.rig import bits_of
 from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 
 SENSOR = (48, 64)
@@ -22,7 +23,7 @@ class Scene:
 
     def frame(self, number: int, settings: CameraSettings) -> np.ndarray:
         """The frame of this exposure."""
-        region, bits = settings.region, int(settings.pixel_format[4:].rstrip("p"))
+        region, bits = settings.region, bits_of(settings)
         assert region is not None
         noise = np.random.default_rng(number).integers(0, 2**bits, (region.height, region.width))
         noise[0, :2] = number // 200, number % 200

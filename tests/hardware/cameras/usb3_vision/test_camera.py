@@ -20,6 +20,8 @@ from thincam_jax.hardware import (
     open_device,
 )
 from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
+from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS
+from thincam_jax.hardware.virtual.rig import bits_of
 from thincam_jax.hardware.virtual.usb3_vision import TRIGGER_MODE, VirtualUsb3Vision
 
 REGION = Region(8, 4, 20, 28)
@@ -29,7 +31,10 @@ def open_camera(device, **options):
     return Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device, **options))
 
 
-@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono10", "Mono12", "Mono16", "Mono12p"])
+FORMATS = "Mono8", "Mono10", "Mono12", "Mono16", "Mono12p", "BayerRG8", "BayerRG12", "BayerRG12p"
+
+
+@pytest.mark.parametrize("pixel_format", FORMATS)
 @pytest.mark.parametrize("region", [None, REGION, Region(0, 0, 16, 20)])
 def test_frames_arrive_exactly(camera, scene, pixel_format, region):
     taken = camera.configure(CameraSettings(0.002, region, pixel_format, gain=6.0))
@@ -39,8 +44,18 @@ def test_frames_arrive_exactly(camera, scene, pixel_format, region):
         frame = camera.trigger_and_grab(1.0)
         assert np.array_equal(frame.pixels, scene.frame(number, taken))
         assert (frame.number, frame.exposure) == (number, 0.002)
-        assert frame.bit_depth == int(pixel_format[4:].rstrip("p"))
-    assert frame.pixels.dtype == (np.uint8 if pixel_format == "Mono8" else np.uint16)
+        assert frame.bit_depth == bits_of(taken)
+    assert frame.pixels.dtype == (np.uint8 if frame.bit_depth == 8 else np.uint16)
+
+
+def test_codes_of_pixel_formats_are_those_of_the_vendors():
+    """Those of PFNC, as Basler's library has them."""
+    from pypylon import pylon
+
+    assert len(PIXEL_FORMATS) == 25
+    for name, (code, bits) in PIXEL_FORMATS.items():
+        assert code == getattr(pylon, f"PixelType_{name}"), name
+        assert bits == pylon.BitDepth(code), name
 
 
 def test_settings_move_to_the_nearest(camera):
@@ -56,9 +71,11 @@ def test_settings_move_to_the_nearest(camera):
         (CameraSettings(0.01, Region(0, 0, 49, 64)), "a part of 48 × 64"),
         (CameraSettings(0.01, Region(0, 0, 4, 64)), "Height of 4 pixels; give at least 16"),
         (
-            CameraSettings(0.01, pixel_format="BayerRG8"),
-            "no pixel format BayerRG8; give one of Mono8, Mono10",
+            CameraSettings(0.01, pixel_format="BayerGB8"),
+            "no pixel format BayerGB8; give one of Mono8, Mono10",
         ),
+        (CameraSettings(0.01, binning=2), "BinningHorizontal of 2; give 1 … 1"),
+        (CameraSettings(0.01, black_level=60.0), "BlackLevel of 60; give 0 … 0"),
     ],
 )
 def test_what_it_cannot_take_is_refused(camera, settings, said):

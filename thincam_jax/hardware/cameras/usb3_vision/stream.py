@@ -28,6 +28,7 @@ IMAGE = 0x0001  # payload type
 
 # Names and numbers of the Pixel Format Naming Convention, with the bits of a count. Bits 16 … 23 of
 # the number are the bits of a pixel on the wire.
+_BAYER = {8: 0x01080008, 10: 0x0110000C, 12: 0x01100010, 16: 0x0110002E}  # GR, then RG, GB, BG
 PIXEL_FORMATS = {
     "Mono8": (0x01080001, 8),
     "Mono10": (0x01100003, 10),
@@ -35,6 +36,10 @@ PIXEL_FORMATS = {
     "Mono16": (0x01100007, 16),
     "Mono12p": (0x010C0047, 12),
 }
+for _place, _colours in enumerate(("GR", "RG", "GB", "BG")):
+    for _bits, _code in _BAYER.items():
+        PIXEL_FORMATS[f"Bayer{_colours}{_bits}"] = _code + _place, _bits
+    PIXEL_FORMATS[f"Bayer{_colours}12p"] = (0x57, 0x59, 0x55, 0x53)[_place] + 0x010C0000, 12
 
 LARGEST_PAYLOAD = 256 << 20  # bytes; a frame of 11000² pixels of 16 bit
 LARGEST_END = 64 << 10  # of a leader or trailer
@@ -87,13 +92,14 @@ def frame_bytes(pixel_format: str, region: Region) -> int:
 
 
 def unpack(data: np.ndarray, pixel_format: str, shape: tuple[int, int]) -> np.ndarray:
-    """Counts (y, x) from the bytes of a frame: uint8 for Mono8, uint16 for all others.
+    """Counts (y, x) from the bytes of a frame: uint8 for 8 bits, uint16 for all others.
 
-    Mono12p holds two pixels in three bytes, low bits first: b₀ + 2⁸(b₁ mod 2⁴) and ⌊b₁/2⁴⌋ + 2⁴b₂.
+    Mono12p and others of 12p hold two pixels in three bytes, low bits first: b₀ + 2⁸(b₁ mod 2⁴) and
+    ⌊b₁/2⁴⌋ + 2⁴b₂.
     """
-    if pixel_format == "Mono8":
+    if PIXEL_FORMATS[pixel_format][1] == 8:
         return data.reshape(shape)
-    if pixel_format != "Mono12p":
+    if not pixel_format.endswith("p"):
         return data.view("<u2").reshape(shape)
     count = shape[0] * shape[1]
     if count % 2:
