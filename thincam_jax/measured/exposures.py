@@ -83,8 +83,8 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     - `full_scale`: largest count. An exposure is left out of a pixel where any of its frames has
       it.
 
-    Gain and dark variance are estimated from the scatter among the frames, over all pixels: light
-    that flickers counts as gain. Pixels within one standard deviation of full scale, where chance
+    Gain and dark variance are estimated from the scatter among the frames, over all pixels. Those
+    within one standard deviation of full scale, where chance
     decides what is left out, are up to 0.4 standard deviations too dark.
 
     **Errors**: ValueError for no exposures, and frames of other pixels.
@@ -102,21 +102,17 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     """
     if not exposures:
         raise ValueError("there are no exposures; give one or more")
-    shape = exposures[0].frames.shape[1:]
-    for one in exposures:
-        if one.frames.shape[1:] != shape:
-            raise ValueError(
-                f"frames of {shape} and {one.frames.shape[1:]} pixels; give equal shapes"
-            )
+    shapes = {one.frames.shape[1:] for one in exposures}
+    if len(shapes) > 1:
+        raise ValueError(f"frames of the pixels {shapes}; give equal shapes")
     times = np.array([one.exposure for one in exposures])
-    dark_variance = [float(_scatter(one.dark).mean()) for one in exposures]
-    read = np.maximum(dark_variance, _ROUNDING)
     counts = np.array([len(one.frames) for one in exposures])
     darks = np.array([len(one.dark) for one in exposures])
-    means = np.stack([_mean(one.frames) - _mean(one.dark) for one in exposures])
-    seen = np.stack([one.frames.max(axis=0) < full_scale for one in exposures])
+    maps = np.swapaxes([moments(one, full_scale) for one in exposures], 0, 1)
+    means, scatter, dark_variance, seen = maps[0], maps[1], maps[3].mean(axis=(1, 2)), maps[4] > 0
+    read = np.maximum(dark_variance, _ROUNDING)
     # Photon noise over signal, mostly of the brightest pixels: the noise of dark ones has no say.
-    excess = np.stack([_scatter(one.frames) for one in exposures]) - read[:, None, None]
+    excess = scatter - read[:, None, None]
     light = float(np.sum(means[seen] ** 2))
     gain = max(float(np.vdot(means[seen], excess[seen])) / light, 0.0) if light > 0 else 0.0
 
@@ -135,13 +131,26 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     full = means[shortest] / times[shortest]
     rate = (weights * along(times) * means).sum(axis=0) / np.where(valid, information, 1.0)
     variance = np.where(valid, 1 / np.where(valid, information, 1.0), np.inf)
-    return MergedExposures(np.where(valid, rate, full), variance, gain, tuple(dark_variance))
+    return MergedExposures(
+        np.where(valid, rate, full), variance, gain, tuple(dark_variance.tolist())
+    )
 
 
-def _mean(frames: np.ndarray) -> np.ndarray:
-    return frames.mean(axis=0, dtype=float)
+def moments(one: ExposedFrames, full_scale: int) -> np.ndarray:
+    """Maps of the light's mean and variance, of the dark's, and where no frame is full."""
+    seen = one.frames.max(axis=0) < full_scale
+    counted = seen if seen.any() else ~seen
+    dark = one.dark.mean(axis=0, dtype=float)
+    light = one.frames.mean(axis=0, dtype=float) - dark
+    # A lamp's flicker changes all pixels in proportion to their light, and is no noise.
+    variance = _variance(one.frames, light / (light.mean(where=counted) or 1.0), counted)
+    dark_variance = _variance(one.dark, np.ones_like(dark), counted)
+    return np.stack([light, variance, dark, dark_variance, seen])
 
 
-def _scatter(frames: np.ndarray) -> np.ndarray:
-    """Variance among frames, unbiased."""
-    return frames.var(axis=0, ddof=1, dtype=float)
+def _variance(frames: np.ndarray, profile: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Variance among frames, unbiased, without a common change of the pixels by a profile."""
+    mean, squares = frames.mean(axis=0, dtype=float), np.zeros_like(profile)
+    for frame in frames:
+        squares += (frame - mean - (frame - mean).mean(where=counted) * profile) ** 2
+    return squares / (len(frames) - 1)

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import MeasurementError, read_arrays, write_whole
 from thincam_jax._core.text import of_error
-from thincam_jax.measured.exposures import ExposedFrames
+from thincam_jax.measured.exposures import ExposedFrames, moments
 from thincam_jax.measured.raw import Raw
 
 _ROUNDING = 1 / 12  # variance of whole counts
@@ -160,7 +160,8 @@ def measure_sensor(
         raise MeasurementError("dark counts of 0 hide their noise; raise the camera's black level")
     times = np.array([one.exposure for one in series])
     frames, darks = (np.array([len(getattr(o, n)) for o in series]) for n in ("frames", "dark"))
-    dark, dark_variance, light, variance, highest = np.swapaxes(list(map(_moments, series)), 0, 1)
+    maps = np.swapaxes([moments(one, full_scale) for one in series], 0, 1)
+    light, variance, dark, dark_variance, seen = maps
     used = np.mean(light + dark > _BRIGHTEST * full_scale, axis=(1, 2)) <= _FEW
     if not used.any():
         raise MeasurementError("the light is over 0.8 of full scale; give a shorter exposure")
@@ -174,7 +175,7 @@ def measure_sensor(
     counted = used * frames
     total = np.tensordot(counted, light, 1)
 
-    odd = (highest[used] >= full_scale).any(axis=0) | ~(total > 0)
+    odd = ~(seen[used].all(axis=0) & (total > 0))
     least = max(float(np.median(noise)), _ROUNDING)
     parts = *(line**2 / darks), counted  # of the variance of a frame
     for values, part in zip((level, rate, total), parts, strict=True):
@@ -207,24 +208,6 @@ def measure_sensor(
     numbers = map(float, (*found, np.linalg.norm(in_electrons)))
     single = (one.astype(np.float32) for one in maps)
     return SensorCalibration(middle, *single, odd, *numbers, full_scale, points)
-
-
-def _moments(one: ExposedFrames) -> tuple[np.ndarray, ...]:
-    """Maps of the dark mean and variance, of the light's mean and variance, and of the maximum."""
-    dark = one.dark.mean(axis=0, dtype=float)
-    light = one.frames.mean(axis=0, dtype=float) - dark
-    # A lamp's flicker changes all pixels in proportion to their light, and is no noise.
-    variance = _variance(one.frames, light / (light.mean() or 1.0))
-    highest = np.maximum(one.frames.max(axis=0), one.dark.max(axis=0))
-    return dark, _variance(one.dark, np.ones_like(dark)), light, variance, highest
-
-
-def _variance(frames: np.ndarray, profile: np.ndarray) -> np.ndarray:
-    """Variance among frames, without what all their pixels have in common."""
-    mean, squares = frames.mean(axis=0, dtype=float), np.zeros_like(profile)
-    for frame in frames:
-        squares += (frame - mean - (frame.mean(dtype=float) - mean.mean()) * profile) ** 2
-    return squares / (len(frames) - 1)
 
 
 def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

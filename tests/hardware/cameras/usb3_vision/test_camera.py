@@ -50,7 +50,7 @@ def test_frames_arrive_exactly(camera, scene, pixel_format, region):
 
 def test_codes_of_pixel_formats_are_those_of_the_vendors():
     """Those of PFNC, as Basler's library has them."""
-    from pypylon import pylon
+    from thincam_jax.hardware.cameras.pylon import pylon
 
     assert len(PIXEL_FORMATS) == 25
     for name, (code, bits) in PIXEL_FORMATS.items():

@@ -28,18 +28,18 @@ IMAGE = 0x0001  # payload type
 
 # Names and numbers of the Pixel Format Naming Convention, with the bits of a count. Bits 16 … 23 of
 # the number are the bits of a pixel on the wire.
-_BAYER = {8: 0x01080008, 10: 0x0110000C, 12: 0x01100010, 16: 0x0110002E}  # GR, then RG, GB, BG
-PIXEL_FORMATS = {
-    "Mono8": (0x01080001, 8),
-    "Mono10": (0x01100003, 10),
-    "Mono12": (0x01100005, 12),
-    "Mono16": (0x01100007, 16),
-    "Mono12p": (0x010C0047, 12),
+_CODES = {  # of 8, 10, 12 and 16 bits, and of two pixels of 12 in three bytes
+    "Mono": (0x01080001, 0x01100003, 0x01100005, 0x01100007, 0x010C0047),
+    "BayerGR": (0x01080008, 0x0110000C, 0x01100010, 0x0110002E, 0x010C0057),
+    "BayerRG": (0x01080009, 0x0110000D, 0x01100011, 0x0110002F, 0x010C0059),
+    "BayerGB": (0x0108000A, 0x0110000E, 0x01100012, 0x01100030, 0x010C0055),
+    "BayerBG": (0x0108000B, 0x0110000F, 0x01100013, 0x01100031, 0x010C0053),
 }
-for _place, _colours in enumerate(("GR", "RG", "GB", "BG")):
-    for _bits, _code in _BAYER.items():
-        PIXEL_FORMATS[f"Bayer{_colours}{_bits}"] = _code + _place, _bits
-    PIXEL_FORMATS[f"Bayer{_colours}12p"] = (0x57, 0x59, 0x55, 0x53)[_place] + 0x010C0000, 12
+PIXEL_FORMATS = {
+    f"{colour}{bits}": (code, int(bits.rstrip("p")))
+    for colour, codes in _CODES.items()
+    for bits, code in zip(("8", "10", "12", "16", "12p"), codes, strict=True)
+}
 
 LARGEST_PAYLOAD = 256 << 20  # bytes; a frame of 11000² pixels of 16 bit
 LARGEST_END = 64 << 10  # of a leader or trailer
