@@ -81,6 +81,15 @@ def test_saturated_pixels_are_left_out():
     np.testing.assert_array_equal(merge_exposures(hidden, FULL).rate, merged.rate)
 
 
+def test_flicker_of_the_lamp_is_no_noise():
+    """Frames of 10 % more and less light: the gain stays that of photon noise."""
+    random = np.random.default_rng(11)
+    dark = taken(0.02, random, scene=0.0 * SCENE).dark
+    lit = [taken(0.02, random, 2, scene=lamp * SCENE).frames for lamp in (0.9, 1.0, 1.1)]
+    merged = merge_exposures([ExposedFrames(0.02, np.concatenate(lit), dark)], FULL)
+    assert merged.gain == pytest.approx(GAIN, rel=0.04)
+
+
 def test_one_exposure_is_the_mean_of_its_frames():
     one = taken(0.002, np.random.default_rng(8))
     merged = merge_exposures([one], FULL)

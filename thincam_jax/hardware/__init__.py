@@ -7,6 +7,7 @@ imports nothing of this; the libraries of the devices come with `thincam-jax[har
 
 from thincam_jax.hardware.acquisition.acquire import acquire as acquire
 from thincam_jax.hardware.acquisition.plan import method_b as method_b
+from thincam_jax.hardware.acquisition.plan import scene as scene
 from thincam_jax.hardware.acquisition.plan import zone_plate as zone_plate
 from thincam_jax.hardware.acquisition.read import read_acquisition as read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig as Rig

@@ -106,8 +106,7 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     if len(shapes) > 1:
         raise ValueError(f"frames of the pixels {shapes}; give equal shapes")
     times = np.array([one.exposure for one in exposures])
-    counts = np.array([len(one.frames) for one in exposures])
-    darks = np.array([len(one.dark) for one in exposures])
+    counts, darks = np.transpose([(len(one.frames), len(one.dark)) for one in exposures])
     maps = np.swapaxes([moments(one, full_scale) for one in exposures], 0, 1)
     means, scatter, dark_variance, seen = maps[0], maps[1], maps[3].mean(axis=(1, 2)), maps[4] > 0
     read = np.maximum(dark_variance, _ROUNDING)

@@ -28,8 +28,8 @@ class Prepared:
     - `capture`: in fractions of full scale divided by `log.capture_divisor`.
     - `valid`: False where the capture is saturated or dead.
     - `log`: what the steps did.
-    - `variance`: of the capture, by a sensor's calibration; infinite where it is not valid. Block
-      means of values that "bilinear" interpolated are taken as independent.
+    - `variance`: of the capture, by a sensor's calibration, for independent values before
+      `downsample`; infinite where not valid.
     """
 
     psf: Float32[np.ndarray, "psf_channel k l"]
@@ -74,8 +74,8 @@ def prepare(
        because a lensless capture has no dark place. 0 subtracts nothing. A `SensorCalibration` `at`
        the image's exposure also divides by the response of each pixel and gives the variance.
        `psf_background` is that of the PSF where it differs. Negative values become 0.
-    3. Saturated pixels (before the subtraction) and dead ones are not valid: those of `dead`, True
-       in a map (y, x) of the sensor (`read_mask`), and those that the calibration calls defective.
+    3. Saturated pixels (before the subtraction), `dead` ones, True in a map (y, x) of the sensor
+       (`read_mask`), and defective ones by the calibration are not valid.
     4. Demosaicing, if the options name a Bayer pattern; then the capture's `crop`.
     5. The PSF onto the capture's pixels, with `psf_scale`.
     6. Exact means of square blocks of `downsample` pixels; remainders are cropped centrally.
@@ -109,10 +109,7 @@ def prepare(
         corners["capture"] = corner.mean(axis=0, keepdims=True)
     levels = {n: _level(b, raws[n], corners[n]) for n, b in backgrounds.items()}
     good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
-    frames = {
-        n: _frame(raw, backgrounds[n], levels[n], _known(good, planes[n].shape), options)
-        for n, raw in raws.items()
-    }
+    frames = {n: _frame(raw, backgrounds[n], levels[n], good, options) for n, raw in raws.items()}
     noise = _noise(frames["psf"].values[square].astype(np.float64), options)
     logs = {n: _image_log(raws[n], backgrounds[n], levels[n], f) for n, f in frames.items()}
     frames = {n: replace(f, values=np.maximum(f.values, 0)) for n, f in frames.items()}
@@ -161,11 +158,8 @@ def prepare(
 
 def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Frame) -> ImageLog:
     kind = background if isinstance(background, str) else "number"
-    noise = None
     if isinstance(background, SensorCalibration):
         kind = f"sensor's calibration at {background.exposure:g} s"
-        trusted = frame.variance[frame.known & ~frame.saturated]
-        noise = raw.full_scale * float(np.sqrt(trusted.mean(dtype=float))) if trusted.size else 0.0
     maximum = raw.pixels.max()
     return ImageLog(
         name=raw.name,
@@ -181,7 +175,7 @@ def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Fram
         clipped=int(np.count_nonzero(frame.values < 0)),
         saturated=int(frame.saturated.sum()),
         dead=int((~frame.known).sum()) // raw.channels,
-        noise=noise,
+        noise=raw.full_scale * float(np.sqrt(frame.variance.mean(dtype=float))) or None,
     )
 
 
@@ -190,9 +184,9 @@ def _frame(
 ) -> _Frame:
     """An image without its background."""
     plane = _in_full_scale(raw)
-    saturated = _saturated(raw, plane, options)
+    saturated, good = _saturated(raw, plane, options), _known(good, plane.shape)
     if not isinstance(background, SensorCalibration):
-        return _Frame(plane - level, saturated, good, np.zeros_like(plane))
+        return _Frame(plane - level, saturated, good, 0 * plane)
     light, variance = (one[None].astype(np.float32) for one in background.correct(raw))
     scale = np.float32(raw.full_scale)
     return _Frame(light / scale, saturated, good & ~background.defective, variance / scale**2)
@@ -242,8 +236,7 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
     if frame.saturated.any():
         saturated = demosaic_mask(frame.saturated[0], pattern, method)
     has = ~nothing if known is None else demosaic_mask(known, pattern, method)
-    variance = demosaiced(frame.variance[0], pattern, method, known, 2)
-    planes = colours, saturated, has, variance
+    planes = colours, saturated, has, demosaiced(frame.variance[0], pattern, method, known, 2)
     return _Frame(*(np.moveaxis(plane, -1, 0) for plane in planes))
 
 

@@ -15,8 +15,7 @@ class ImageLog:
     - `background`: "corner", "number" or the name of the dark frame; `level`: what was subtracted,
       the mean of each channel in fractions of full scale.
     - `clipped`: pixels that this made negative, and that became 0.
-    - `saturated`, `dead`: pixels. `noise`: standard deviation of the others, root mean square in
-      counts, by a sensor's calibration.
+    - `saturated`, `dead`: pixels. `noise`: by a sensor's calibration, root mean square, counts.
     """
 
     name: str

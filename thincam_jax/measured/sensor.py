@@ -28,7 +28,6 @@ from thincam_jax.measured.exposures import ExposedFrames, moments
 from thincam_jax.measured.raw import Raw
 
 _ROUNDING = 1 / 12  # variance of whole counts
-_BRIGHTEST = 0.8  # of full scale
 _FEW = 0.01  # share of the pixels that may be brighter, and of dark counts that may be 0
 _PLACES = tuple(np.s_[i::2, j::2] for i in (0, 1) for j in (0, 1))  # of a Bayer pattern
 
@@ -45,9 +44,9 @@ class SensorCalibration:
     - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; without a rate, with
       that of the dark current.
     - `photon_transfer`: of each level, mean light, counts, additional variance and its error.
-    - names with `_error`: standard errors.
 
-    It holds for the camera's gain, black level, pixel format, binning and region.
+    `_error` is a standard error. It holds for the camera's gain, black level, pixel format, binning
+    and region.
     """
 
     exposure: float
@@ -87,22 +86,20 @@ class SensorCalibration:
     def correct(self, raw: Raw) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"]]:
         """Light u of a frame, counts, and its variance; both 0 in defective pixels.
 
-        The variance is that of photon noise, by the pixel's own count, of read noise, and of the
-        calibration. MeasurementError for other pixels or another full scale.
+        The variance is that of photon noise, by the pixel's own count, read noise and calibration.
         """
-        known = self.response.shape, self.full_scale
-        given = raw.pixels.shape, int(raw.full_scale)
+        known, given = (self.response.shape, self.full_scale), (raw.pixels.shape, raw.full_scale)
         if known != given:
             raise MeasurementError(
                 f"the sensor was measured with (pixels, full scale) {known}, and {raw.name} has "
                 f"{given}; give frames of the same region, binning and pixel format, and `bits`"
             )
         light, gain = raw.pixels - self.dark_level, self.conversion_gain
-        response = np.where(self.defective, 1, self.response)
+        per_response = np.where(self.defective, 0, 1 / np.where(self.defective, 1, self.response))
         photons = gain * np.maximum(light + self.dark_rate * self.exposure, 0)
-        variance = photons + (gain * self.read_noise) ** 2 + _ROUNDING
-        variance += self.dark_level_error**2 + (light * self.response_error / response) ** 2
-        return ~self.defective * light / response, ~self.defective * variance / response**2
+        variance = photons + (gain * self.read_noise) ** 2 + _ROUNDING + self.dark_level_error**2
+        variance += (light * self.response_error * per_response) ** 2
+        return light * per_response, variance * per_response**2
 
     def save(self, path: str | Path) -> Path:
         """Write it to one file, .npz."""
@@ -133,8 +130,7 @@ def measure_sensor(
 ) -> SensorCalibration:
     r"""Measure a sensor with frames of an evenly lit surface and dark frames.
 
-    - `series`: one exposure or more, as `Acquisition.exposed` reads them from a rig's store;
-      several show the dark current, and the line of photon transfer.
+    - `series`: exposures, as `Acquisition.exposed` reads them; several show the dark current.
     - `outlier`: difference from the neighbours, in standard deviations, of a defective pixel.
     - `mosaic`: of a Bayer pattern: the mean response is 1 at each of its four places, so that the
       colour of the light has no effect.
@@ -159,10 +155,10 @@ def measure_sensor(
     if max(np.mean(one.dark == 0) for one in series) > _FEW:
         raise MeasurementError("dark counts of 0 hide their noise; raise the camera's black level")
     times = np.array([one.exposure for one in series])
-    frames, darks = (np.array([len(getattr(o, n)) for o in series]) for n in ("frames", "dark"))
+    frames, darks = np.transpose([(len(one.frames), len(one.dark)) for one in series])
     maps = np.swapaxes([moments(one, full_scale) for one in series], 0, 1)
     light, variance, dark, dark_variance, seen = maps
-    used = np.mean(light + dark > _BRIGHTEST * full_scale, axis=(1, 2)) <= _FEW
+    used = np.mean(light + dark > 0.8 * full_scale, axis=(1, 2)) <= _FEW
     if not used.any():
         raise MeasurementError("the light is over 0.8 of full scale; give a shorter exposure")
     # Weights of the dark means that give the line of each pixel, and of the variances.
@@ -172,8 +168,7 @@ def measure_sensor(
     line = np.stack([darks / darks.sum(), moment / spread])
     level, rate = np.tensordot(line, dark, 1)
     noise = np.tensordot(degrees / degrees.sum(), dark_variance, 1)
-    counted = used * frames
-    total = np.tensordot(counted, light, 1)
+    total = np.tensordot(counted := used * frames, light, 1)
 
     odd = ~(seen[used].all(axis=0) & (total > 0))
     least = max(float(np.median(noise)), _ROUNDING)
@@ -204,8 +199,8 @@ def measure_sensor(
     variances = *np.tensordot(line**2 / darks, of_dark, 1), np.tensordot(counted, of_light, 1)
     errors = np.sqrt(np.stack(variances, dtype=np.float32))
     maps = level, errors[0], rate, errors[1], good * total / scale, good * errors[2] / scale
-    found = gain, np.linalg.norm(in_gain), np.sqrt(max(read.mean(), 0.0)) / gain
-    numbers = map(float, (*found, np.linalg.norm(in_electrons)))
+    found = np.sqrt(max(read.mean(), 0.0)) / gain, np.linalg.norm(in_electrons)
+    numbers = map(float, (gain, np.linalg.norm(in_gain), *found))
     single = (one.astype(np.float32) for one in maps)
     return SensorCalibration(middle, *single, odd, *numbers, full_scale, points)
 
@@ -230,6 +225,5 @@ def _stands_out(values: np.ndarray, outlier: float, error: float) -> np.ndarray:
     found = np.zeros(values.shape, bool)
     for place in _PLACES:
         difference = np.abs(values[place] - scipy.ndimage.median_filter(values[place], 5))
-        spread = max(1.4826 * float(np.median(difference)), error)
-        found[place] = difference > outlier * spread
+        found[place] = difference > outlier * max(1.4826 * float(np.median(difference)), error)
     return found

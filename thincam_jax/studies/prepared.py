@@ -50,10 +50,7 @@ class PixelNoise:
 
 
 def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
-    """Noise of a prepared capture: of a raw pixel's `counts`, or estimated from the capture.
-
-    Where a sensor's calibration is the capture's background, the counts are its.
-    """
+    """Noise of a prepared capture: of raw `counts`, by a sensor's calibration, or estimated."""
     log, how = prepared.log, "given"
     if counts is None and log.capture.noise is not None:
         counts, how = log.capture.noise, "photon and read noise by the sensor's calibration"

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # it brings JAX
     from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 FRINGE_SCAN = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)  # phases, rad
-_NEW_DEFAULTS = ("black_level", None), ("binning", 1)
+_LEFT_OUT = ("black_level", None), ("binning", 1)  # which older plans do not have
 PHASE_PAIR = (0.0, 1.5 * math.pi)
 
 
@@ -133,9 +133,8 @@ class Plan:
         plan = {
             "name": self.name,
             "patterns": [[p.kind, dict(p.numbers)] for p in self.patterns],
-            # Without what older plans do not have, so that their hashes stay.
             "settings": [
-                {k: v for k, v in dataclasses.asdict(s).items() if (k, v) not in _NEW_DEFAULTS}
+                dict(one for one in dataclasses.asdict(s).items() if one not in _LEFT_OUT)
                 for s in self.settings
             ],
             "steps": [[s.pattern, s.position, s.settings, s.dark] for s in self.steps],

@@ -14,7 +14,6 @@ from thincam_jax.hardware.acquisition.journal import frame_records, read_journal
 from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
 from thincam_jax.hardware.base import CameraSettings
-from thincam_jax.measured import bayer
 from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge_exposures
 from thincam_jax.measured.raw import Raw
 
@@ -53,11 +52,6 @@ class Acquisition:
         (rows, columns), region = self.sensor_shape, self.settings[0].region
         top, left = (0, 0) if region is None else (region.top, region.left)
         return slice(top, top + rows), slice(left, left + columns)
-
-    @property
-    def bayer(self) -> bayer.Pattern | None:
-        """Bayer pattern of the frames, for `Preparation` and `demosaic`; None for grey ones."""
-        return self.settings[0].bayer
 
     def raw(self, step: int) -> Raw:
         """Frame of a step as `prepare` takes it."""

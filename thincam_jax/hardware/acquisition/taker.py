@@ -289,10 +289,11 @@ def full_scale(frame: Frame) -> int:
 
 def _same(first: CameraSettings, second: CameraSettings) -> bool:
     """Whether two settings agree up to the rounding of registers."""
-    numbers = zip(*((one.gain, one.black_level or 0.0) for one in (first, second)), strict=True)
     exact = {(one.region, one.pixel_format, one.binning) for one in (first, second)}
+    levels = first.black_level, second.black_level
     return (
         len(exact) == 1
+        and (None in levels or math.isclose(*levels, abs_tol=1e-3))
         and math.isclose(first.exposure, second.exposure, rel_tol=1e-4)
-        and all(math.isclose(*pair, abs_tol=1e-3) for pair in numbers)
+        and math.isclose(first.gain, second.gain, abs_tol=1e-3)
     )
