@@ -4,6 +4,7 @@ Names are those of the functions below; without one all are drawn, in some minut
 """
 
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 
@@ -225,8 +227,41 @@ def masks():
     return figure
 
 
+def photon_transfer():
+    """A frame of an evenly lit sensor, corrected, and the line: the example of the rig's page."""
+    page = (ROOT / "docs/guide/rig.md").read_text("utf-8")
+    names: dict = {}
+    os.chdir(tempfile.mkdtemp())
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)  # the project's own page
+    sensor, raw, part = names["sensor"], names["raw"], np.s_[100:164, 100:180]
+    light, _ = sensor.at(0.1).correct(raw)
+    frame = raw.pixels - sensor.dark_level.mean()
+    light = np.where(sensor.defective, np.nan, light)
+    figure = Figure(figsize=(11, 3.1), layout="constrained")
+    panels = figure.subplots(1, 3, width_ratios=(1, 1, 1.1))
+    mean = float(np.nanmean(light))
+    grey = colormaps["gray"].with_extremes(bad="k")
+    titles = "frame minus mean dark level", "corrected; defective pixels black"
+    for ax, image, title in zip(panels, (frame, light), titles, strict=False):
+        shown = ax.imshow(image[part] / mean, cmap=grey, vmin=0.9, vmax=1.1)
+        ax.set(title=title, xlabel="x (pixels)", ylabel="y (pixels)")
+    figure.colorbar(shown, ax=panels[:2], label="light (mean = 1)", shrink=0.8)
+    means, variances, errors = sensor.photon_transfer.T
+    line = np.array([0.0, 1.05 * means[-1]])
+    slope = f"slope {sensor.conversion_gain:.4f} ± {sensor.conversion_gain_error:.4f}"
+    panels[2].plot(
+        line, sensor.conversion_gain * line, color="0.6", label=f"{slope} counts/electron"
+    )
+    panels[2].errorbar(means, variances, errors, fmt="ko", ms=4, label="eight exposures")
+    panels[2].set(xlabel="mean light (counts)", ylabel="variance of light (counts²)")
+    panels[2].set(xlim=(0, None), ylim=(0, 1.3 * variances[-1]), title="photon transfer")
+    panels[2].legend(loc="upper left", fontsize=8, frameon=False)
+    return figure
+
+
 _DESIGNS = (design_landscape, design_front, suggest, screen_design)
-_DRAWN = (models, calibration, *_DESIGNS, depth, sweep, masks, which_mask)
+_DRAWN = (models, calibration, *_DESIGNS, depth, sweep, masks, which_mask, photon_transfer)
 PAGES = {f.__name__: f for f in _DRAWN}
 
 for name in sys.argv[1:] or PAGES:

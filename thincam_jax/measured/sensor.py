@@ -45,8 +45,7 @@ class SensorCalibration:
       that of the dark current.
     - `photon_transfer`: of each level, mean light, counts, additional variance and its error.
 
-    `_error` is a standard error. It holds for the camera's gain, black level, pixel format, binning
-    and region.
+    `_error`: standard error. It holds for one gain, black level, pixel format, binning and region.
     """
 
     exposure: float
