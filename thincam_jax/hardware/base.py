@@ -108,7 +108,8 @@ class CameraSettings:
     @property
     def bayer(self) -> Pattern | None:
         """Bayer pattern of the region; the format names the sensor's. None for grey ones."""
-        every = [one for one in PATTERNS if self.pixel_format.startswith(f"Bayer{one[:2]}")]
+        name = self.pixel_format[:7]
+        every: list[Any] = [one for one in PATTERNS if name == f"Bayer{one[:2]}"]
         top, left = (self.region.top, self.region.left) if self.region else (0, 0)
         return shifted_pattern(every[0], top, left) if every else None
 

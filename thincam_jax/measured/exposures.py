@@ -143,8 +143,7 @@ def moments(one: ExposedFrames, full_scale: int) -> np.ndarray:
     light = one.frames.mean(axis=0, dtype=float) - dark
     # A lamp's flicker changes all pixels in proportion to their light, and is no noise.
     variance = _variance(one.frames, light / (light.mean(where=counted) or 1.0), counted)
-    dark_variance = _variance(one.dark, np.ones_like(dark), counted)
-    return np.stack([light, variance, dark, dark_variance, seen])
+    return np.stack([light, variance, dark, _variance(one.dark, np.ones_like(dark), counted), seen])
 
 
 def _variance(frames: np.ndarray, profile: np.ndarray, counted: np.ndarray) -> np.ndarray:

@@ -133,9 +133,8 @@ def prepare(
     image = _filled(frames["capture"], "capture")
     sums, divisor = _psf_divisor(light, options), _capture_divisor(image, options)
     valid = frames["capture"].known & ~frames["capture"].saturated
-    variance = None
-    if isinstance(background, SensorCalibration):
-        variance = np.where(valid, frames["capture"].variance / np.float32(divisor**2), np.inf)
+    variance = np.where(valid, frames["capture"].variance / np.float32(divisor**2), np.inf)
+    variance = variance if isinstance(background, SensorCalibration) else None
     log = PreparationLog(
         options=options,
         psf=logs["psf"],

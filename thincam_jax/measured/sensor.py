@@ -16,6 +16,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -110,7 +111,7 @@ class SensorCalibration:
     def load(cls, path: str | Path) -> "SensorCalibration":
         """Read what `save` has written; MeasurementError, one line, for any other file."""
         try:
-            found = read_arrays(path)
+            found: Any = read_arrays(path)
             return cls(**{name: one if one.ndim else one.item() for name, one in found.items()})
         except OSError:
             raise
@@ -200,22 +201,21 @@ def measure_sensor(
     maps = level, errors[0], rate, errors[1], good * total / scale, good * errors[2] / scale
     found = np.sqrt(max(read.mean(), 0.0)) / gain, np.linalg.norm(in_electrons)
     numbers = map(float, (gain, np.linalg.norm(in_gain), *found))
-    single = (one.astype(np.float32) for one in maps)
-    return SensorCalibration(middle, *single, odd, *numbers, full_scale, points)
+    single = [one.astype(np.float32) for one in maps]
+    every: list[Any] = [middle, *single, odd, *numbers, full_scale, points]
+    return SensorCalibration(*every)
 
 
 def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """K, what each pixel adds to its error, and the line's points, of maps (level, pixel)."""
-    means, weights = light.mean(axis=1), np.ones(len(light))
-    for _ in range(2):  # the second time weighted by what the first leaves
-        gain = float(weights @ excess.mean(axis=1) / (weights @ means))
-        residual = excess - gain * light
-        scatter = residual.var(axis=1)
-        in_gain = weights @ residual / (weights @ means) / light.shape[1]
-        weights = means / np.maximum(scatter, _ROUNDING)
+    means, averages = light.mean(axis=1), excess.mean(axis=1)
+    scatter = (excess - averages.sum() / means.sum() * light).var(axis=1)
+    weights = means / np.maximum(scatter, _ROUNDING)
+    gain = float(weights @ averages / (weights @ means))
+    in_gain = weights @ (excess - gain * light) / (weights @ means) / light.shape[1]
     if not gain > 4 * np.linalg.norm(in_gain):
         raise MeasurementError("the variance does not grow with the light; give raw frames")
-    points = means, excess.mean(axis=1), np.sqrt(scatter / light.shape[1])
+    points = means, averages, np.sqrt(scatter / light.shape[1])
     return gain, in_gain, np.stack(points, axis=1)
 
 

@@ -290,10 +290,10 @@ def full_scale(frame: Frame) -> int:
 def _same(first: CameraSettings, second: CameraSettings) -> bool:
     """Whether two settings agree up to the rounding of registers."""
     exact = {(one.region, one.pixel_format, one.binning) for one in (first, second)}
-    levels = first.black_level, second.black_level
+    levels = [one for one in (first.black_level, second.black_level) if one is not None]
     return (
         len(exact) == 1
-        and (None in levels or math.isclose(*levels, abs_tol=1e-3))
+        and math.isclose(min(levels, default=0), max(levels, default=0), abs_tol=1e-3)
         and math.isclose(first.exposure, second.exposure, rel_tol=1e-4)
         and math.isclose(first.gain, second.gain, abs_tol=1e-3)
     )
