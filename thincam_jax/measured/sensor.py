@@ -45,8 +45,7 @@ class SensorCalibration:
     - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; without a rate, with
       that of the dark current.
     - `photon_transfer`: of each level, mean light, counts, additional variance and its error.
-
-    `_error`: standard error. It holds for one gain, black level, pixel format, binning and region.
+    - `_error`: standard error. All hold for one gain, black level, format, binning and region.
     """
 
     exposure: float
