@@ -211,12 +211,7 @@ def gain(values):
     return f"{np.mean(values):+.2f} ± {half:.2f} (least {np.min(values):+.2f})"
 
 
-LOSES = pytest.mark.xfail(reason="0.3 and 1.1 dB below total variation at 20 and 30 dB")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=LOSES) if n == "method A" else n for n in CASES]
-)
+@pytest.mark.parametrize("name", CASES)
 def test_plug_and_play(name, capsys):
     if not (PHOTOGRAPHS / "cc-by-sa/validation").is_dir():
         pytest.skip(f"no photographs in {PHOTOGRAPHS}; set THINCAM_PHOTOGRAPHS")

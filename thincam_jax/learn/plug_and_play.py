@@ -5,11 +5,11 @@ Half-quadratic splitting (Zhang et al., DPIR, IEEE Trans. Pattern Anal. 44, 6360
 .. math:: z = \arg\min_z \tfrac12 \sum_k w_k (A_k z - g_k)^2 + \tfrac1{2 s^2} \|z - f\|^2,
     \qquad f = D(z, \sigma)
 
-with w = 1/variance and a deviation s of the prior that falls from step to step. The noise of z has
-the covariance :math:`C = M^{-1} A^T w A M^{-1}` with :math:`M = A^T w A + s^{-2}`. A mode that
-the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at most
-s/2. σ/s is one number for a camera and its noise, found from C. s falls until the variance of the
-pixels of z, the diagonal of :math:`M^{-1}`, comes near s²: then most of z is the denoiser's.
+with w = 1/variance and a deviation s of the prior that falls from step to step. With
+:math:`M = A^T w A + s^{-2}` the noise of z has the covariance :math:`M^{-1} A^T w A M^{-1}`: a mode
+that the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at
+most s/2, which is σ. A last data step, with s/4, gives back what the denoiser took from modes that
+the captures know well.
 """
 
 import dataclasses
@@ -56,14 +56,14 @@ from thincam_jax.reconstruction.solver import (
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# s falls from twice the brightness of the image to a sixth of that; given a start, from a twelfth.
-# From once the brightness dark images at 20 dB stay 1.5 dB below; from three times 40 dB lose 0.2.
-_FIRST, _LAST, _WARM = 2, 1 / 6, 1 / 12
-# Where the deviation of z is then below that part of s, s is halved up to four times more. It gains
-# a FlatCam 1.5 to 2.5 dB, a MURA up to 0.5; a dark room loses 0.8 dB without that condition.
-_KNOWN, _HALVINGS = 0.96, 4
-# Factor that was best or close to it for two masks at 20 to 40 dB.
-_MARGIN = 1.1
+# s falls from twice the brightness of the image to a 24th of it; given a start, from a twelfth of
+# that. From once the brightness dark images at 20 dB stay 1.5 dB below.
+_FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 12
+# σ/s, the largest noise of a mode: with that of the mean mode, 0.3 to 0.46, noise in a band of
+# frequencies is not removed (methods A and B lose up to 3 dB).
+_SIGMA = 0.5
+# s of the last data step over σ. It gains a FlatCam up to 5 dB.
+_FINAL = 0.5
 # Weight and iterations of the image by total variation from which several planes begin, and fields
 # with more pixels than the captures: what captures hardly show takes too many data steps. It gains
 # planes up to 0.9 dB; a dark room at 40 dB up to 15 dB.
@@ -185,6 +185,8 @@ class PlugAndPlay(AbstractIterativeSolver):
                 if callback is not None and callback(progress):
                     status = "stopped"
                     break
+            if status != "non_finite":
+                images = [run.finished() for run in runs]
         except KeyboardInterrupt:
             status = "interrupted"
         done, seconds = max(len(history) - 1, 0), time.perf_counter() - began
@@ -216,13 +218,12 @@ class _Run:
         level = uniform_image(problem) / self.unit
         seen = brightness(self.image) if warm else jnp.max(level)
         self.first = or_one(_FIRST * seen) * (_WARM if warm else 1)
-        self.warm, self.ratio, self.largest = warm, jnp.asarray(0.5), self.first
-        self.last = _LAST
+        self.warm, self.largest, self.sigma = warm, self.first, self.first
         self.misfit = self.gap = self.change = math.nan
         self.is_done = False
 
     def advance(self, number: int) -> None:
-        """Data step and denoiser; the first one finds the noise, and σ/s for all others."""
+        """Data step and denoiser; the first one finds the noise."""
         if self.is_done:
             return
         solver = self.solver
@@ -230,40 +231,34 @@ class _Run:
         if number:
             begin = _WARM if self.warm else 1.0
             part = (number - 1) / max(solver.iterations - 1, 1)
-            s = self.largest * begin * (self.last / begin) ** part
-        shift = 1 / (s**2 * self.precision)
-        found = _data_step(self.normal, self.right, self.image, shift, self.precision)
+            s = self.largest * begin * (_LAST / begin) ** part
+        shift, found = self._data_step(s)
         if not bool(jnp.isfinite(found).all()):
             self.misfit, self.is_done = math.nan, True
             return
-        sigma = s * self.ratio * solver.strength.astype(s.dtype)
-        batch = jnp.broadcast_to(sigma, found.shape[:-2])
-        image = solver.denoiser(found, batch)
+        self.sigma = s * _SIGMA * solver.strength.astype(s.dtype)
+        image = solver.denoiser(found, jnp.broadcast_to(self.sigma, found.shape[:-2]))
         image = jnp.maximum(image, 0) if solver.nonnegative else image
         chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
         if number == 0:
             mistake = noise_mistake(self.normal, found, shift, self.precision)
             self.precision = self.precision / mistake**2
             self.largest = or_one(_FIRST * brightness(image))
-            self._plan(image)
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
             self.image, self.result = image, image * self.unit
         self.is_done = number > 0 and self.change < solver.tolerance
 
-    def _plan(self, image: Image) -> None:
-        """The last s, and σ/s: the larger of those at the first and the last."""
+    def finished(self) -> Image:
+        """The image after one more data step."""
+        _, image = self._data_step(self.sigma * _FINAL)
+        image = jnp.maximum(image, 0) if self.solver.nonnegative else image
+        return jnp.where(jnp.isfinite(image).all(), image * self.unit, self.result)
 
-        def shift():
-            return 1 / ((self.largest * self.last) ** 2 * self.precision)
-
-        self.ratio = noise_ratio(self.normal, 1 / (self.largest**2 * self.precision))
-        for _ in range(_HALVINGS):
-            if remaining_deviation(self.normal, shift(), image) >= _KNOWN:
-                break
-            self.last /= 2
-        if self.last < _LAST:
-            self.ratio = jnp.maximum(self.ratio, noise_ratio(self.normal, shift()))
+    def _data_step(self, s: Float[Array, ""]):
+        """The shift of the normal equations, and z."""
+        shift = 1 / (s**2 * self.precision)
+        return shift, _data_step(self.normal, self.right, self.image, shift, self.precision)
 
 
 def _is_slow(problem: InverseProblem) -> bool:
@@ -289,34 +284,6 @@ def brightness(image: Image) -> Float[Array, ""]:
     """Brightness of what is bright, Σ f³/Σ f² over f > 0: dark surroundings do not count."""
     bright = jnp.maximum(image, 0)
     return jnp.sum(bright**3) / or_one(jnp.sum(bright**2))
-
-
-@eqx.filter_jit
-def noise_ratio(normal: AbstractNormal, shift: Float[Array, ""]) -> Float[Array, ""]:
-    r"""σ/s of a data step: :math:`1.1\,(\mathrm{tr}\,C^2/\mathrm{tr}\,C)^{1/2}/s`, at most 0.55.
-
-    The variance of the noise of z, averaged over its modes by the power in each, from one random
-    vector of signs (Hutchinson, Commun. Stat. 18, 1059, 1989).
-    """
-    signs, once = _probed(normal, shift)
-    twice = _roughly(normal.shifted(shift), once)
-    noise = shift * (once - shift * twice)  # C v/s²
-    power = jnp.sum(signs * noise)
-    ratio = jnp.sqrt(jnp.sum(noise**2) / or_one(power))
-    return _MARGIN * jnp.where(power > 0, jnp.clip(ratio, 0.05, 0.5), 0.5)
-
-
-@eqx.filter_jit
-def remaining_deviation(
-    normal: AbstractNormal, shift: Float[Array, ""], image: Image
-) -> Float[Array, ""]:
-    r"""Deviation of z over s where an image is bright,
-    :math:`(\sum_i f_i^2 M^{-1}_{ii}/\sum_i f_i^2)^{1/2}/s`: dark surroundings do not count.
-    """
-    signs, once = _probed(normal, shift)
-    weight = jnp.maximum(image, 0) ** 2
-    variance = jnp.sum(weight * signs * once) / or_one(jnp.sum(weight))
-    return jnp.sqrt(shift * jnp.maximum(variance, 0))
 
 
 @eqx.filter_jit
