@@ -16,6 +16,7 @@ from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.measured.bayer import PATTERNS, Pattern, shifted_pattern
 
 Opened = TypeVar("Opened", bound="Device")
+SOFTWARE = "Software"  # the trigger that this package sends
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class CameraSettings:
     gain: Annotated[float, quantity("dB")] = 0.0
     black_level: Annotated[float | None, quantity(optional=True)] = None  # None: the camera's own
     binning: Annotated[int, whole(1, 16)] = 1  # pixels joined along each axis; `region` counts them
+    trigger: str = SOFTWARE  # GenICam's name of its source: Line0, … for an external one
 
     @property
     def bayer(self) -> Pattern | None:
@@ -130,7 +132,7 @@ class Frame:
 
 
 class Camera(Device):
-    """A camera that exposes one frame for each trigger."""
+    """A camera that exposes one frame for each trigger, its own or one at `settings.trigger`."""
 
     @property
     @abstractmethod
@@ -153,6 +155,7 @@ class Camera(Device):
     def trigger_and_grab(self, timeout: float) -> Frame:
         """Trigger once and return the frame exposed then; `timeout` in s, beyond the exposure.
 
+        With an external trigger it waits for the next one instead; earlier ones do not count.
         `Timeout` where no frame came, `IncompleteFrame` where part of it is missing, `Disconnected`
         where the camera has gone. Never a frame exposed before the trigger.
         """

@@ -94,6 +94,7 @@ def test_a_matrix_of_captures_agrees_with_direct_simulation(tmp_path):
         pytest.param("zaber", marks=pytest.mark.thorough),
         pytest.param("grbl", marks=pytest.mark.thorough),
         "pylon",
+        "line",
     ],
 )
 def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, tmp_path):
@@ -102,6 +103,8 @@ def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, 
     raw["virtual"]["fiducial"] = True
     if devices == "pylon":
         raw["camera"]["driver"] = "pylon"
+    elif devices == "line":
+        raw["camera"]["trigger"] = "Line0"
     else:
         raw["stage"] = {"driver": devices}
         raw["plan"] = {"kind": "method_a", "betas": ["60 rad/mm^2"], "width": "1.44 mm"}
@@ -118,6 +121,7 @@ def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, 
         assert abs(fiducial.position / 1000 - (step.position or 0.0)) < 0.01
         seen.add(fiducial)
     assert len(seen) == len(taken.plan.steps)
+    assert taken.settings[0].trigger == raw["camera"].get("trigger", "Software")
 
 
 def test_a_store_is_not_written_over_and_a_missing_one_not_resumed(method_b, tmp_path):

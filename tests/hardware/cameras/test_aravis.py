@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -101,6 +102,11 @@ def test_frames_and_settings(fake):
         frame = camera.trigger_and_grab(TIMEOUT)
         assert (frame.number, frame.bit_depth, frame.pixels.dtype) == (4, 16, np.uint16)
         assert sixteen.region is not None and frame.pixels.shape == (2, 2048)
+        assert camera.configure(replace(SETTINGS, trigger="Line0")).trigger == "Line0"
+        with pytest.raises(Timeout, match="is the trigger connected to Line0"):
+            camera.trigger_and_grab(0.1)
+        camera._features.set("TriggerMode", "Off")  # frames without pulses, in their place
+        assert [camera.trigger_and_grab(TIMEOUT).number for _ in range(2)] == [5, 6]
 
 
 @needs_aravis

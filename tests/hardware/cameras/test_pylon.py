@@ -1,5 +1,7 @@
 """`PylonCamera` on the emulator that Basler ships, as it is and fed with frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -124,12 +126,27 @@ def test_without_a_region_the_whole_sensor(camera):
         (CameraSettings(1e-3, black_level=2e3), "BlackLevel of 2000; give 0 … 1023"),
         (CameraSettings(1e-3, pixel_format="BayerRG8", binning=2), "give binning 1"),
         (CameraSettings(1e-3, gain=100.0), "0 … 48 dB"),
+        (CameraSettings(1e-3, trigger="Line9"), "no trigger source Line9; give one of Software, L"),
     ],
 )
 def test_what_the_camera_lacks_is_refused_before_anything_is_written(camera, settings, allowed):
     with pytest.raises(OutOfRange, match=allowed):
         camera.configure(settings)
     assert camera.trigger_and_grab(TIMEOUT).pixels.shape == (12, 20)
+
+
+def test_frames_at_a_line_are_awaited(camera, scene):
+    """The emulator has no pulses: it runs freely, behind the driver's back, in their place."""
+    taken = camera.configure(replace(SETTINGS, trigger="Line1"))
+    assert taken.trigger == "Line1" and camera._features.get("TriggerMode") == "On"
+    with pytest.raises(Timeout, match="no frame within 0.101 s; is the .* connected to Line1[?]"):
+        camera.trigger_and_grab(0.1)
+    camera._features.set("TriggerMode", "Off")
+    camera._put(scene.expose(taken), 12)
+    assert [camera.trigger_and_grab(TIMEOUT).number for _ in range(3)] == [0, 1, 2]
+    camera._features.set("TriggerMode", "On")
+    assert camera.configure(SETTINGS).trigger == "Software"
+    assert camera.trigger_and_grab(TIMEOUT).number == 3
 
 
 def test_unknown_camera_and_no_settings(monkeypatch, scene):

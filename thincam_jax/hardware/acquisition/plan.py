@@ -20,13 +20,14 @@ import numpy as np
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import check_fields
-from thincam_jax.hardware.base import CameraSettings, Region
+from thincam_jax.hardware.base import SOFTWARE, CameraSettings, Region
 
 if TYPE_CHECKING:  # it brings JAX
     from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 FRINGE_SCAN = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)  # phases, rad
-_LEFT_OUT = ("black_level", None), ("binning", 1)  # which older plans do not have
+# Settings that older plans do not have.
+_LEFT_OUT = ("black_level", None), ("binning", 1), ("trigger", SOFTWARE)
 PHASE_PAIR = (0.0, 1.5 * math.pi)
 
 

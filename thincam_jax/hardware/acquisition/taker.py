@@ -289,8 +289,9 @@ def full_scale(frame: Frame) -> int:
 
 def _same(first: CameraSettings, second: CameraSettings) -> bool:
     """Whether two settings agree up to the rounding of registers."""
-    exact = {(one.region, one.pixel_format, one.binning) for one in (first, second)}
-    levels = [one for one in (first.black_level, second.black_level) if one is not None]
+    both = (first, second)
+    exact = {(one.region, one.pixel_format, one.binning, one.trigger) for one in both}
+    levels = [one.black_level for one in both if one.black_level is not None]
     return (
         len(exact) == 1
         and math.isclose(min(levels, default=0), max(levels, default=0), abs_tol=1e-3)

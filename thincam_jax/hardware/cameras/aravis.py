@@ -27,7 +27,7 @@ _BUFFERS = 4
 
 
 class AravisCamera(FeatureCamera):
-    """A camera supported by aravis, with one frame for each software trigger.
+    """A camera supported by aravis, with one frame for each trigger.
 
     After a failed frame the stream is restarted, so that a late one is not taken for the next. A
     camera that does not answer for 2.5 s is `Disconnected`.
@@ -91,14 +91,17 @@ class AravisCamera(FeatureCamera):
         deadline = time.monotonic() + settings.exposure + timeout
         try:
             with self._translated("grab"):
+                if self._external:
+                    self._stop()  # with frames that are exposed already
                 self._start()
                 self.flush()
-                self._wait_until_ready(deadline)
-                self._features.execute("TriggerSoftware")
+                if not self._external:
+                    self._wait_until_ready(deadline)
+                    self._features.execute("TriggerSoftware")
                 left = max(deadline - time.monotonic(), 0.0)
                 buffer = self._stream.timeout_pop_buffer(int(1e6 * left))
                 if buffer is None:
-                    raise self._timeout("grab", "no frame came after the trigger")
+                    raise self._no_frame(timeout)
                 frame = self._frame(buffer, settings)
                 self._stream.push_buffer(buffer)
                 return frame

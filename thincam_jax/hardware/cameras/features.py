@@ -8,7 +8,7 @@ from collections.abc import Collection
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, runtime_checkable
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Region
+from thincam_jax.hardware.base import SOFTWARE, Camera, CameraSettings, Region
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
 COLOURS = "Mono", "BayerGR", "BayerRG", "BayerGB", "BayerBG"
@@ -87,8 +87,23 @@ class FeatureCamera(Camera):
             raise OutOfRange(self._name, "grab", "it has no settings", "call configure before")
         return self._settings
 
-    def _timeout(self, operation: str, cause: str) -> Timeout:
-        return Timeout(self._name, operation, cause, "try again, or allow more time")
+    @property
+    def _external(self) -> bool:
+        """Whether frames are triggered by a line."""
+        return self._require_settings().trigger != SOFTWARE
+
+    def _timeout(self, operation: str, cause: str, remedy: str = "try again") -> Timeout:
+        return Timeout(self._name, operation, cause, f"{remedy}, or allow more time")
+
+    def _no_frame(self, timeout: float, also: str = "") -> Timeout:
+        """The error of a frame that did not come within `timeout` s of its exposure's end."""
+        if not self._external:
+            cause = f"no frame within {timeout:g} s of the end of the exposure{also}"
+            return self._timeout("trigger", cause, "trigger again")
+        settings = self._require_settings()
+        cause = f"no frame within {settings.exposure + timeout:g} s{also}"
+        remedy = f"is the trigger connected to {settings.trigger}?"
+        return Timeout(self._name, "wait for a trigger", cause, remedy)
 
     def _require(self, asked: CameraSettings, shape: tuple[int, int]) -> None:
         """OutOfRange for a region, format or number that the camera does not support."""
@@ -100,6 +115,9 @@ class FeatureCamera(Camera):
         formats = [name for name in features.choices("PixelFormat") if name in self._formats]
         if asked.pixel_format not in formats:
             raise refuse(f"no pixel format {asked.pixel_format}", f"one of {', '.join(formats)}")
+        sources = _sources(features)
+        if asked.trigger not in sources:
+            raise refuse(f"no trigger source {asked.trigger}", f"one of {', '.join(sources)}")
         region = asked.region or Region(0, 0, *shape)
         bottom, right = region.top + region.height, region.left + region.width
         inside = min(region.top, region.left) >= 0 and bottom <= shape[0] and right <= shape[1]
@@ -152,6 +170,11 @@ class FrameCount:
         return self._offset + counted
 
 
+def _sources(features: Features) -> tuple[str, ...]:
+    name = "TriggerSource"
+    return features.choices(name) if features.has(name) else (SOFTWARE,)
+
+
 def trigger_by_software(features: Features) -> None:
     """Configure one frame for each software trigger, with nothing automatic."""
 
@@ -166,7 +189,7 @@ def trigger_by_software(features: Features) -> None:
         put("TriggerSelector", selector)
         put("TriggerMode", "On" if selector == "FrameStart" else "Off")
     put("TriggerSelector", "FrameStart")
-    put("TriggerSource", "Software")
+    put("TriggerSource", SOFTWARE)
 
 
 def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -> CameraSettings:
@@ -190,6 +213,10 @@ def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -
         _put_within(features, "Gain", asked.gain)
     if asked.black_level is not None and features.has("BlackLevel"):
         _put_within(features, "BlackLevel", asked.black_level)
+    if features.has("TriggerSource"):
+        _put(features, "TriggerSource", asked.trigger)
+    if asked.trigger != SOFTWARE and features.has("TriggerActivation"):
+        _put(features, "TriggerActivation", "RisingEdge")
     return read(features)
 
 
@@ -204,7 +231,8 @@ def read(features: Features) -> CameraSettings:
     exposure = float(features.get(_exposure(features))) * _MICROSECOND
     level = float(features.get("BlackLevel")) if features.has("BlackLevel") else None
     form, binning = str(features.get("PixelFormat")), pixels(_BINNING[0]) or 1
-    return CameraSettings(exposure, region, form, gain, level, binning)
+    trigger = text(features, "TriggerSource") or SOFTWARE
+    return CameraSettings(exposure, region, form, gain, level, binning, trigger)
 
 
 def _exposure(features: Features) -> str:

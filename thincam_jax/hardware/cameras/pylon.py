@@ -101,16 +101,21 @@ class PylonCamera(FeatureCamera):
         milliseconds = int(1e3 * (settings.exposure + timeout)) + 1
         try:
             with self._translated("grab"):
+                if self._external:
+                    self._stop()  # with frames that are exposed already
                 if not self._camera.IsGrabbing():
                     self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne)
                     self._count.restart()
                 self.flush()
-                self._camera.WaitForFrameTriggerReady(
-                    milliseconds, pylon.TimeoutHandling_ThrowException
-                )
-                self._trigger()
+                if not self._external:
+                    self._camera.WaitForFrameTriggerReady(
+                        milliseconds, pylon.TimeoutHandling_ThrowException
+                    )
+                    self._trigger()
                 result = self._camera.RetrieveResult(milliseconds, pylon.TimeoutHandling_Return)
                 try:
+                    if not result.IsValid():
+                        raise self._no_frame(timeout)
                     return self._frame(result, settings)
                 finally:
                     result.Release()
@@ -128,8 +133,6 @@ class PylonCamera(FeatureCamera):
         self._camera.ExecuteSoftwareTrigger()
 
     def _frame(self, result: Any, settings: CameraSettings) -> Frame:
-        if not result.IsValid():
-            raise self._timeout("grab", "no frame came after the trigger")
         if not result.GrabSucceeded():
             cause = result.ErrorDescription or f"pylon's error {result.ErrorCode:#x}"
             raise errors.IncompleteFrame(

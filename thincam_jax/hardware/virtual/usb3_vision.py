@@ -47,6 +47,7 @@ EXPOSURE, GAIN, FRAME_RATE = range(FEATURES + 0x20, FEATURES + 0x38, 8)  # float
 ACQUISITION_MODE, START, STOP, TRIGGER_SELECTOR, TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER = range(
     FEATURES + 0x40, FEATURES + 0x5C, 4
 )
+LINE0 = 1  # of TriggerSource; 0 is Software
 LIMITS = {EXPOSURE: (10.0, 1e7), GAIN: (0.0, 24.0), FRAME_RATE: (0.1, 1000.0)}
 LEAST_SIZE = 16
 
@@ -122,7 +123,8 @@ class VirtualUsb3Vision(IBackend):
 
     `expose(settings)` returns the counts (y, x), uint16, of the frame exposed at the trigger, of
     the size of `settings.region`, in an array not changed afterwards. With TriggerMode Off frames
-    are exposed when the client reads, at AcquisitionFrameRate.
+    are exposed when the client reads, at AcquisitionFrameRate; with TriggerSource Line0, at pulses
+    of an external clock `line_period` s apart. Nothing is connected to Line1.
     """
 
     def __init__(
@@ -131,9 +133,11 @@ class VirtualUsb3Vision(IBackend):
         sensor_shape: tuple[int, int] = (2048, 2048),
         serial: str = "0001",
         faults: Faults | None = None,
+        line_period: float = 0.02,
     ):
         self.faults = faults or Faults()
         self._expose, self._shape, self._serial = expose, sensor_shape, serial
+        self._line_period = line_period
         self._xml = Path(__file__).with_suffix(".xml").read_bytes()
         self._power_on()
 
@@ -143,7 +147,7 @@ class VirtualUsb3Vision(IBackend):
         self._answers: deque[tuple[float, bytes]] = deque()
         self._frames: deque[tuple[float, memoryview]] = deque()
         self._waiting, self._block, self._acquiring = 0, 0, False
-        self._due = 0.0  # when a free-running camera has its next frame
+        self._due = 0.0  # when a camera that is not triggered by software has its next frame
         self._last: tuple[memoryview, ...] = ()
         memory = self._memory = bytearray(XML) + self._xml + bytes(-len(self._xml) % 4)
         texts = {Abrm.MANUFACTURER: STRINGS[1], Abrm.MODEL: STRINGS[2],
@@ -172,7 +176,10 @@ class VirtualUsb3Vision(IBackend):
         return struct.unpack_from("<I", self._memory, address)[0]
 
     def _frame_time(self) -> float:
-        return 1 / struct.unpack_from("<d", self._memory, FRAME_RATE)[0]
+        """Seconds between frames without a software trigger, inf where there are none."""
+        if not self._number(TRIGGER_MODE):
+            return 1 / struct.unpack_from("<d", self._memory, FRAME_RATE)[0]
+        return self._line_period if self._number(TRIGGER_SOURCE) == LINE0 else np.inf
 
     @property
     def settings(self) -> CameraSettings:
@@ -240,7 +247,8 @@ class VirtualUsb3Vision(IBackend):
                 raise _Refused(Status.ACCESS_DENIED)
             self._check_geometry(address, value)
         elif address == TRIGGER:
-            self._expose_frame(ready and ready + LATE)  # the frame is later than the answer
+            if not self._number(TRIGGER_SOURCE):
+                self._expose_frame(ready and ready + LATE)  # the frame is later than the answer
         elif address == START:
             self._acquiring, self._block = True, 0
             self._due = monotonic() + self._frame_time()
@@ -418,7 +426,7 @@ class VirtualUsb3Vision(IBackend):
         """Read the next transfer, or as much as fits, within `timeout` ms."""
         self._alive(dev_handle)
         queue: deque[tuple[float, Any]] = self._answers if ep == CONTROL_IN else self._frames
-        if ep == STREAM_IN and not queue and self._acquiring and not self._number(TRIGGER_MODE):
+        if ep == STREAM_IN and not queue and self._acquiring and self._frame_time() < np.inf:
             self._expose_frame(self._due)
             self._due = max(self._due, monotonic()) + self._frame_time()
         wait = queue[0][0] - monotonic() if queue else np.inf

@@ -2,6 +2,7 @@
 
 import errno
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -76,6 +77,7 @@ def test_settings_move_to_the_nearest(camera):
         ),
         (CameraSettings(0.01, binning=2), "BinningHorizontal of 2; give 1 … 1"),
         (CameraSettings(0.01, black_level=60.0), "BlackLevel of 60; give 0 … 0"),
+        (CameraSettings(0.01, trigger="Line7"), "no trigger source Line7; give one of Software, L"),
     ],
 )
 def test_what_it_cannot_take_is_refused(camera, settings, said):
@@ -102,6 +104,29 @@ def test_a_frame_that_nobody_asked_for_is_discarded(device, camera, scene, flush
         camera.flush()
     frame = camera.trigger_and_grab(1.0)
     assert np.array_equal(frame.pixels, scene.frame(1, device.settings))
+
+
+def test_frames_at_a_line_are_awaited(device, camera, scene):
+    settings = CameraSettings(0.002, trigger="Line0")
+    assert camera.configure(settings).trigger == "Line0"
+    started = time.monotonic()
+    frames = [camera.trigger_and_grab(1.0) for _ in range(3)]
+    assert time.monotonic() - started > 3 * 0.02
+    assert [frame.number for frame in frames] == [0, 1, 2]
+    device._expose_frame()  # a pulse before the call does not count
+    exposed = scene.exposures
+    assert scene.number_in(camera.trigger_and_grab(1.0).pixels) == exposed
+    camera.configure(CameraSettings(0.002))
+    exposed = scene.exposures
+    assert scene.number_in(camera.trigger_and_grab(1.0).pixels) == exposed
+
+
+def test_a_line_without_pulses_is_named(device, camera, scene):
+    camera.configure(CameraSettings(0.01, trigger="Line1"))
+    with pytest.raises(Timeout, match=r"no frame within 0.11 s.*; is the .* connected to Line1\?$"):
+        camera.trigger_and_grab(0.1)
+    camera._features.execute("TriggerSoftware")  # is ignored
+    assert scene.exposures == 0
 
 
 def test_a_camera_of_several_is_chosen_by_serial(scene):

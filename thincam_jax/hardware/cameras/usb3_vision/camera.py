@@ -1,4 +1,4 @@
-"""A USB3 Vision camera, triggered by software, one frame at a time."""
+"""A USB3 Vision camera, one frame for each trigger."""
 
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
@@ -103,24 +103,25 @@ class Usb3VisionCamera(FeatureCamera):
 
     def trigger_and_grab(self, timeout: float) -> Frame:
         settings = self._require_settings()
-        if not self._in_step:
+        if self._external or not self._in_step:
             self._restart()
         self._in_step = False
         before = self._control.clock() if self._compare_clocks else 0
-        self._features.execute("TriggerSoftware")
+        if not self._external:
+            self._features.execute("TriggerSoftware")
         deadline = monotonic() + settings.exposure + timeout
         discarded = 0
         while True:
             try:
                 leader, data = self._stream.read(deadline)
             except Timeout as error:
-                raise self._no_frame(timeout, discarded) from error
+                raise self._no_frame(timeout, f", {discarded} older ones discarded") from error
             if leader.block > self._last_block and leader.time >= before:
                 break
             self._last_block = max(self._last_block, leader.block)
             discarded += 1
             if monotonic() > deadline:
-                raise self._no_frame(timeout, discarded)
+                raise self._no_frame(timeout, f", {discarded} older ones discarded")
         self._last_block, self._in_step = leader.block, True
         shape = leader.region.height, leader.region.width
         return Frame(
@@ -130,11 +131,6 @@ class Usb3VisionCamera(FeatureCamera):
             settings.exposure,
             PIXEL_FORMATS[settings.pixel_format][1],
         )
-
-    def _no_frame(self, timeout: float, discarded: int) -> Timeout:
-        cause = f"no frame within {timeout:g} s of the end of the exposure"
-        return Timeout(self._name, "trigger", f"{cause}, {discarded} older ones discarded",
-                       "trigger again, or allow more time")  # fmt: skip
 
     def _translated(self, operation: str) -> AbstractContextManager[None]:
         return self._features.evaluating(operation)
