@@ -329,7 +329,13 @@ def blocks(*kinds: str) -> list[tuple[str, str]]:
 
 
 # The shipped file into which a section of a page fits.
-FITS = {"mask": "mura", "object": "moving", "plan": "rig_scene", "methods": "fza_harmonics"}
+FITS = {
+    "mask": "mura",
+    "object": "moving",
+    "plan": "rig_scene",
+    "camera": "rig_scene",
+    "methods": "fza_harmonics",
+}
 
 
 def sections():

@@ -22,6 +22,7 @@ _BUILT_IN = {
         "usb3_vision": "thincam_jax.hardware.cameras.usb3_vision:Usb3VisionCamera",
         "pylon": "thincam_jax.hardware.cameras.pylon:PylonCamera",
         "aravis": "thincam_jax.hardware.cameras.aravis:AravisCamera",
+        "pylablib": "thincam_jax.hardware.cameras.pylablib:PylablibCamera",
     },
     "stages": {
         "zaber": "thincam_jax.hardware.stages.zaber:ZaberStage",

@@ -92,18 +92,16 @@ class FeatureCamera(Camera):
         """Whether frames are triggered by a line."""
         return self._require_settings().trigger != SOFTWARE
 
-    def _timeout(self, operation: str, cause: str, remedy: str = "try again") -> Timeout:
-        return Timeout(self._name, operation, cause, f"{remedy}, or allow more time")
+    def _timeout(self, operation: str, cause: str) -> Timeout:
+        return Timeout(self._name, operation, cause, "try again, or allow more time")
 
     def _no_frame(self, timeout: float, also: str = "") -> Timeout:
-        """The error of a frame that did not come within `timeout` s of its exposure's end."""
-        if not self._external:
-            cause = f"no frame within {timeout:g} s of the end of the exposure{also}"
-            return self._timeout("trigger", cause, "trigger again")
         settings = self._require_settings()
+        remedy = "trigger again, or allow more time"
+        if self._external:
+            remedy = f"is the trigger connected to {settings.trigger}?"
         cause = f"no frame within {settings.exposure + timeout:g} s{also}"
-        remedy = f"is the trigger connected to {settings.trigger}?"
-        return Timeout(self._name, "wait for a trigger", cause, remedy)
+        return Timeout(self._name, "wait for a frame", cause, remedy)
 
     def _require(self, asked: CameraSettings, shape: tuple[int, int]) -> None:
         """OutOfRange for a region, format or number that the camera does not support."""
@@ -115,7 +113,8 @@ class FeatureCamera(Camera):
         formats = [name for name in features.choices("PixelFormat") if name in self._formats]
         if asked.pixel_format not in formats:
             raise refuse(f"no pixel format {asked.pixel_format}", f"one of {', '.join(formats)}")
-        sources = _sources(features)
+        source = "TriggerSource"
+        sources = features.choices(source) if features.has(source) else (SOFTWARE,)
         if asked.trigger not in sources:
             raise refuse(f"no trigger source {asked.trigger}", f"one of {', '.join(sources)}")
         region = asked.region or Region(0, 0, *shape)
@@ -170,11 +169,6 @@ class FrameCount:
         return self._offset + counted
 
 
-def _sources(features: Features) -> tuple[str, ...]:
-    name = "TriggerSource"
-    return features.choices(name) if features.has(name) else (SOFTWARE,)
-
-
 def trigger_by_software(features: Features) -> None:
     """Configure one frame for each software trigger, with nothing automatic."""
 
@@ -213,10 +207,9 @@ def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -
         _put_within(features, "Gain", asked.gain)
     if asked.black_level is not None and features.has("BlackLevel"):
         _put_within(features, "BlackLevel", asked.black_level)
-    if features.has("TriggerSource"):
-        _put(features, "TriggerSource", asked.trigger)
-    if asked.trigger != SOFTWARE and features.has("TriggerActivation"):
-        _put(features, "TriggerActivation", "RisingEdge")
+    for name, value in (("TriggerSource", asked.trigger), ("TriggerActivation", "RisingEdge")):
+        if features.has(name):
+            _put(features, name, value)
     return read(features)
 
 

@@ -47,7 +47,7 @@ EXPOSURE, GAIN, FRAME_RATE = range(FEATURES + 0x20, FEATURES + 0x38, 8)  # float
 ACQUISITION_MODE, START, STOP, TRIGGER_SELECTOR, TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER = range(
     FEATURES + 0x40, FEATURES + 0x5C, 4
 )
-LINE0 = 1  # of TriggerSource; 0 is Software
+LINE0, LINE_PERIOD = 1, 0.02  # value of TriggerSource, 0 is Software; s between pulses
 LIMITS = {EXPOSURE: (10.0, 1e7), GAIN: (0.0, 24.0), FRAME_RATE: (0.1, 1000.0)}
 LEAST_SIZE = 16
 
@@ -124,7 +124,7 @@ class VirtualUsb3Vision(IBackend):
     `expose(settings)` returns the counts (y, x), uint16, of the frame exposed at the trigger, of
     the size of `settings.region`, in an array not changed afterwards. With TriggerMode Off frames
     are exposed when the client reads, at AcquisitionFrameRate; with TriggerSource Line0, at pulses
-    of an external clock `line_period` s apart. Nothing is connected to Line1.
+    of an external clock, `LINE_PERIOD` s apart. Nothing is connected to Line1.
     """
 
     def __init__(
@@ -133,11 +133,9 @@ class VirtualUsb3Vision(IBackend):
         sensor_shape: tuple[int, int] = (2048, 2048),
         serial: str = "0001",
         faults: Faults | None = None,
-        line_period: float = 0.02,
     ):
         self.faults = faults or Faults()
         self._expose, self._shape, self._serial = expose, sensor_shape, serial
-        self._line_period = line_period
         self._xml = Path(__file__).with_suffix(".xml").read_bytes()
         self._power_on()
 
@@ -179,7 +177,7 @@ class VirtualUsb3Vision(IBackend):
         """Seconds between frames without a software trigger, inf where there are none."""
         if not self._number(TRIGGER_MODE):
             return 1 / struct.unpack_from("<d", self._memory, FRAME_RATE)[0]
-        return self._line_period if self._number(TRIGGER_SOURCE) == LINE0 else np.inf
+        return LINE_PERIOD if self._number(TRIGGER_SOURCE) == LINE0 else np.inf
 
     @property
     def settings(self) -> CameraSettings:
@@ -251,7 +249,7 @@ class VirtualUsb3Vision(IBackend):
                 self._expose_frame(ready and ready + LATE)  # the frame is later than the answer
         elif address == START:
             self._acquiring, self._block = True, 0
-            self._due = monotonic() + self._frame_time()
+            self._due = monotonic() + min(self._frame_time(), LINE_PERIOD)
         elif address == STOP:
             self._acquiring = False
         elif address == Abrm.TIMESTAMP_LATCH:

@@ -205,7 +205,7 @@ def test_endless_stale_frames_end_in_a_timeout(device, camera):
     camera.configure(CameraSettings(0.01))
     camera._features.set("TriggerMode", "Off")
     camera._control.clock = lambda: 2**63
-    with pytest.raises(Timeout, match="older ones discarded"):
+    with pytest.raises(Timeout, match=r"[1-9]\d* older ones discarded"):
         camera.trigger_and_grab(0.01)
     assert device._number(TRIGGER_MODE) == 0
 
