@@ -98,10 +98,10 @@ def chain(count, link):
     ids=["chain", "long chain", "selectors", "decimal", "hexadecimal", "elsewhere"],
 )
 def test_xml_that_takes_time_or_memory_is_refused_before(xml, said):
-    started, taken = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    started, taken = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match=said):
         features.check_xml(xml)
-    assert time.monotonic() - started < 5
+    assert time.process_time() - started < 5
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - taken < 400_000  # kB
 
 
