@@ -142,7 +142,7 @@ def test_measured_psfs_and_operators_need_the_crop():
         ([Matrix(jnp.ones((6, 20)), (4, 5), (2, 3))] * 2, "operators were given"),
     ):
         solver, reason = tc.choose_solver(tc.Recording(jnp.ones((2, 2, 3)), imaging_model))
-        assert solver.name == "admm_tv" and message in reason
+        assert solver.name == "admm_tv" and message in reason and "PlugAndPlay" in reason
 
 
 @pytest.fixture(scope="module")

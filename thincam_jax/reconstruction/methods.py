@@ -138,9 +138,9 @@ def choose_solver(
     """Choose `Wiener`, `AdmmTV` or `Fista`, and give the reason in a sentence.
 
     The fast filter is chosen where it is as good, see `filter_suffices`; `Fista` for `LowRank`
-    operators, of which each iteration of ADMM takes some 80 applications. `PlugAndPlay` is named
-    where it gained with every camera measured, one plane of computed cameras, but not chosen: what
-    it has not learned, such as text, it may do worse.
+    operators, of which each iteration of ADMM takes some 80 applications. `PlugAndPlay` gained with
+    every camera measured and is named, but not chosen: what it has not learned, such as text, it
+    may do worse.
 
     - `synthesis`: sums of captures for the solver; see `AdmmTV`.
 
@@ -161,8 +161,7 @@ def choose_solver(
     if synthesis is None and (over_field or any(isinstance(one, LowRank) for one in operators)):
         return Fista(), "a sum of many convolutions is applied once an iteration, ADMM solves it"
     suffices, reason = filter_suffices(recording, synthesis)
-    model = recording.imaging_model
-    if not suffices and isinstance(model, Cameras) and np.ndim(model.object_distance) == 0:
+    if not suffices:
         reason += "; of photographs PlugAndPlay makes images some tenths of a decibel better"
     return (Wiener if suffices else AdmmTV)(synthesis=synthesis), reason
 
