@@ -109,7 +109,10 @@ def prepare(
         corners["capture"] = corner.mean(axis=0, keepdims=True)
     levels = {n: _level(b, raws[n], corners[n]) for n, b in backgrounds.items()}
     good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
-    frames = {n: _frame(raw, backgrounds[n], levels[n], good, options) for n, raw in raws.items()}
+    frames = {
+        n: _frame(raws[n], plane, backgrounds[n], levels[n], good, options)
+        for n, plane in planes.items()
+    }
     noise = _noise(frames["psf"].values[square].astype(np.float64), options)
     logs = {n: _image_log(raws[n], backgrounds[n], levels[n], f) for n, f in frames.items()}
     frames = {n: replace(f, values=np.maximum(f.values, 0)) for n, f in frames.items()}
@@ -179,13 +182,17 @@ def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Fram
 
 
 def _frame(
-    raw: Raw, background: Background, level: np.ndarray, good: np.ndarray, options: Preparation
+    raw: Raw,
+    plane: np.ndarray,
+    background: Background,
+    level: np.ndarray,
+    good: np.ndarray,
+    options: Preparation,
 ) -> _Frame:
-    """An image without its background."""
-    plane = _in_full_scale(raw)
+    """An image, `plane` in full scale, without its background."""
     saturated, good = _saturated(raw, plane, options), _known(good, plane.shape)
     if not isinstance(background, SensorCalibration):
-        return _Frame(plane - level, saturated, good, 0 * plane)
+        return _Frame(plane - level, saturated, good, np.zeros_like(plane))
     light, variance = (one[None].astype(np.float32) for one in background.correct(raw))
     scale = np.float32(raw.full_scale)
     return _Frame(light / scale, saturated, good & ~background.defective, variance / scale**2)
@@ -231,11 +238,13 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
     known = None if frame.known.all() else frame.known[0]
     colours = demosaic(frame.values[0], pattern, method, known)
     nothing = np.zeros(colours.shape, bool)
-    saturated = nothing
+    saturated, variance = nothing, np.zeros_like(colours)
     if frame.saturated.any():
         saturated = demosaic_mask(frame.saturated[0], pattern, method)
+    if frame.variance.any():
+        variance = demosaiced(frame.variance[0], pattern, method, known, 2)
     has = ~nothing if known is None else demosaic_mask(known, pattern, method)
-    planes = colours, saturated, has, demosaiced(frame.variance[0], pattern, method, known, 2)
+    planes = colours, saturated, has, variance
     return _Frame(*(np.moveaxis(plane, -1, 0) for plane in planes))
 
 
@@ -275,7 +284,8 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
         for plane in planes
     ]
     light = np.maximum(np.stack(values), 0).astype(frame.values.dtype)
-    return _Frame(light, light < 0, light >= 0, 0 * light)
+    nothing = np.zeros(light.shape, bool)
+    return _Frame(light, nothing, ~nothing, np.zeros_like(light))
 
 
 def _downsampled(
@@ -296,9 +306,10 @@ def _means(frame: _Frame, factor: int) -> _Frame:
     """Means of the known pixels of each block, summed in float64; 0 where none is known."""
     kept = central_blocks(frame.values.shape[1:], factor)
     values, saturated, known, variance = (plane[:, *kept] for plane in vars(frame).values())
-    total, spread = (
-        block_sum(np.where(known, one, 0), factor, np.float64) for one in (values, variance)
-    )
+    total = block_sum(np.where(known, values, 0), factor, np.float64)
+    spread = np.zeros_like(total)
+    if variance.any():
+        spread = block_sum(np.where(known, variance, 0), factor, np.float64)
     count = block_sum(known, factor)
     means, spread = total / np.maximum(count, 1), spread / np.maximum(count, 1) ** 2
     saturated = block_sum(saturated, factor) > 0
