@@ -149,9 +149,9 @@ def as_complex(value: Float[Array, "..."]) -> Complex[Array, "..."]:
     return jax.lax.complex(value, jnp.zeros_like(value))
 
 
-def squared_modulus(spectrum: Complex[Array, "..."]) -> Float[Array, "..."]:
+def squared_modulus(value: Complex[Array, "..."]) -> Float[Array, "..."]:
     """|z|², without the root that `abs` takes."""
-    return spectrum.real**2 + spectrum.imag**2
+    return value.real**2 + value.imag**2
 
 
 def scaled(spectrum: Complex[Array, "..."], factor: Float[Array, "..."]) -> Complex[Array, "..."]:

@@ -14,7 +14,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
-from thincam_jax._core.precision import as_complex, phasor
+from thincam_jax._core.precision import as_complex, phasor, squared_modulus
 from thincam_jax._core.random import Key, random_key
 from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner, place
 from thincam_jax.lensless.propagation.angular_spectrum import (
@@ -96,7 +96,7 @@ def _to_and_fro(target, grid: Grid, path: Path, cells: tuple[int, int], key, ste
     def step(phase, _):
         field = to_sensor(phase)
         seen = cut(field, seen_corner, grid.shape)
-        error = match_error(seen.real**2 + seen.imag**2, target)
+        error = match_error(squared_modulus(seen), target)
         wanted = as_complex(amplitude) * phasor(jnp.angle(seen))
         # The adjoint of `propagate` runs light backwards: the conjugate of its conjugate's.
         back = propagate(place(wanted, seen_corner, window).conj(), grid.pitch, path).conj()

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.precision import product
+from thincam_jax._core.precision import product, squared_modulus
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
 from thincam_jax.imaging.operators.base import is_shape
 from thincam_jax.imaging.operators.separable import Separable
@@ -463,7 +463,7 @@ def _norm(problem: InverseProblem) -> Float[Array, ""]:
         return or_one(found)
     # Placing on the window and cropping have norm 1: the transfer functions bound the norm.
     power = sum(
-        jnp.max(w) * jnp.sum(o.spectrum.real**2 + o.spectrum.imag**2, axis=-3)
+        jnp.max(w) * jnp.sum(squared_modulus(o.spectrum), axis=-3)
         for o, w in zip(operators, problem.weights, strict=True)
     )
     return or_one(jnp.minimum(found, jnp.sqrt(jnp.max(power))))

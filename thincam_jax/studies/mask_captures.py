@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.precision import squared_modulus
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
@@ -181,7 +182,7 @@ def _best_linear(camera: CropConvolution, spectra, seen: Seen, precision):
         return cut(jnp.fft.irfft2(spectrum, s=window), corner, camera.field_shape)
 
     back = jax.linear_transpose(see, jax.ShapeDtypeStruct(camera.field_shape, seen.channels.dtype))
-    power = jnp.sum(spectra.real**2 + spectra.imag**2, axis=0)
+    power = jnp.sum(squared_modulus(spectra), axis=0)
     symbol = difference_symbol(window, seen.channels.dtype)
     uniform = see(jnp.ones(camera.field_shape, seen.channels.dtype))
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float, Num
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid, fast_shape
+from thincam_jax._core.precision import squared_modulus
 from thincam_jax.imaging.operators.base import AbstractOperator
 
 
@@ -114,7 +115,7 @@ class CropConvolution(AbstractOperator):
 
         Pixels from which no light reaches the sensor count like the others.
         """
-        return jnp.mean(plane_mean(self.spectrum.real**2 + self.spectrum.imag**2, self.window[1]))
+        return jnp.mean(plane_mean(squared_modulus(self.spectrum), self.window[1]))
 
     def with_channels_and_planes(self) -> "CropConvolution":
         """The same map on images (…, channel, plane, m, n), its planes summed."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean
-from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
+from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast, squared_modulus
 from thincam_jax.lensless.accuracy.lines import (
     SparseGrid,
     angular_spectrum_terms,
@@ -96,7 +96,7 @@ def _direct_sum(
     lit = lit_mask(mask, plane, path)
     sensor = points.refined(method.samples) if method.pixel_integration else points
     field = rayleigh_sommerfeld_field(lit, plane, sensor, path)
-    irradiance = (field.real**2 + field.imag**2) * path.magnification**2
+    irradiance = squared_modulus(field) * path.magnification**2
     return block_mean(irradiance, method.samples) if method.pixel_integration else irradiance
 
 

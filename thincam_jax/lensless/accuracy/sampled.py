@@ -33,6 +33,7 @@ from thincam_jax._core.precision import (
     allow,
     cast,
     precision_of,
+    squared_modulus,
 )
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.accuracy.probe import spread
@@ -173,7 +174,7 @@ def _lines(fields: Complex[Array, "line m"], pitch, path: Path, count: int, padd
     def one(field):
         ended = propagate(jnp.pad(field, (0, window - samples))[None], pitch, path)
         ended = jnp.roll(ended, (count - samples) // 2, axis=1)[0, :count]
-        return ended.real**2 + ended.imag**2
+        return squared_modulus(ended)
 
     return jax.vmap(one)(fields)
 

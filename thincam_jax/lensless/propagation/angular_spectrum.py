@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_shape
-from thincam_jax._core.precision import as_complex, turn_phasor
+from thincam_jax._core.precision import as_complex, squared_modulus, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.path import ChiefRay, Path
@@ -142,7 +142,7 @@ def angular_spectrum(
     # Sample j of the sensor is sample j + (mask − sensor)/2 of the periodic window.
     shift = [(s - m) // 2 for s, m in zip(sensor.shape, plane.shape, strict=True)]
     field = jnp.roll(field, shift, axis=(0, 1))[: sensor.shape[0], : sensor.shape[1]]
-    irradiance = (field.real**2 + field.imag**2) * path.magnification**2
+    irradiance = squared_modulus(field) * path.magnification**2
     if ray is not None:
         irradiance = irradiance * _in_window(ray, window, sensor, path)
     if method.pixel_integration:

@@ -11,7 +11,7 @@ from numpy.polynomial.hermite import hermgauss
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import as_complex, flat_root, phasor
+from thincam_jax._core.precision import as_complex, flat_root, phasor, squared_modulus
 from thincam_jax.lensless.masks.base import AbstractMask, other_models
 from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod
@@ -111,7 +111,7 @@ def irradiance(mask: RadialMask, path: Path, rho: Float[Array, "*at"]) -> Float[
 
     discs = mask.radii, -jnp.diff(mask.rings, append=0)
     field, _ = jax.lax.scan(added, as_complex(jnp.zeros_like(rho)), discs)
-    return field.real**2 + field.imag**2
+    return squared_modulus(field)
 
 
 def _disc_field(a: Float[Array, ""], b: Float[Array, ""], rho: Float[Array, "*at"]):

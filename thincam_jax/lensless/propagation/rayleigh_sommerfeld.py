@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean
-from thincam_jax._core.precision import turn_phasor
+from thincam_jax._core.precision import squared_modulus, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes, within
@@ -73,5 +73,5 @@ def rayleigh_sommerfeld(
     field = rayleigh_sommerfeld_field(
         lit_mask(within(mask, plane), plane, path), plane, sensor, path, path.chief_ray(mask.centre)
     )
-    irradiance = (field.real**2 + field.imag**2) * path.magnification**2
+    irradiance = squared_modulus(field) * path.magnification**2
     return block_mean(irradiance, method.samples) if method.pixel_integration else irradiance

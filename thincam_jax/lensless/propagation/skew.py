@@ -12,7 +12,7 @@ from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import as_complex, phasor, product
+from thincam_jax._core.precision import as_complex, phasor, product, squared_modulus
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import Path
@@ -103,7 +103,7 @@ def skew_image(
     if nodes is None:
         middle = jnp.zeros((), y.dtype)
         waves = coefficients[:, None, None] * rows.waves(middle)
-        return _image(waves, columns.waves(middle), lambda field: field.real**2 + field.imag**2)
+        return _image(waves, columns.waves(middle), squared_modulus)
     places, shares = leggauss(nodes)
     half = grid.pitch / path.magnification / 2
     offsets = jnp.asarray(places, y.dtype) * half
