@@ -103,8 +103,8 @@ class PlugAndPlay(AbstractIterativeSolver):
     - `strength`: σ relative to the one found; more gives smoother images, less leaves noise.
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: as of `AdmmTV`.
-    - `iterations`: data steps after the first one. `tolerance`: change of an image, relative to its
-      length, below which it is done.
+    - `iterations`: data steps after the first one; all are done, as s falls to the last of them.
+      `tolerance`: change in the last one, relative to an image's length, that counts as converged.
 
     **Errors**: ValueError, one line, for values out of range; CheckpointError for a damaged file.
 
@@ -179,9 +179,8 @@ class PlugAndPlay(AbstractIterativeSolver):
                     status = "non_finite"
                     break
                 history.append(progress)
-                if all(run.is_done for run in runs):
+                if number == self.iterations and progress.dual < self.tolerance:
                     status = "converged"
-                    break
                 if callback is not None and callback(progress):
                     status = "stopped"
                     break
@@ -220,12 +219,9 @@ class _Run:
         self.first = or_one(_FIRST * seen) * (_WARM if warm else 1)
         self.warm, self.largest, self.sigma = warm, self.first, self.first
         self.misfit = self.gap = self.change = math.nan
-        self.is_done = False
 
     def advance(self, number: int) -> None:
         """Data step and denoiser; the first one finds the noise."""
-        if self.is_done:
-            return
         solver = self.solver
         s = self.first
         if number:
@@ -234,7 +230,7 @@ class _Run:
             s = self.largest * begin * (_LAST / begin) ** part
         shift, found = self._data_step(s)
         if not bool(jnp.isfinite(found).all()):
-            self.misfit, self.is_done = math.nan, True
+            self.misfit = math.nan
             return
         self.sigma = s * _SIGMA * solver.strength.astype(s.dtype)
         image = solver.denoiser(found, jnp.broadcast_to(self.sigma, found.shape[:-2]))
@@ -247,7 +243,6 @@ class _Run:
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
             self.image, self.result = image, image * self.unit
-        self.is_done = number > 0 and self.change < solver.tolerance
 
     def finished(self) -> Image:
         """The image after one more data step."""
