@@ -160,6 +160,15 @@ def test_start_callback_and_status():
     easy = tc.PlugAndPlay(smooth, iterations=5, tolerance=0.9)
     ended = tc.reconstruct(seen, easy, start=jnp.asarray(scene()))
     assert ended.status == "converged" and ended.iterations == 5
+
+    # What a denoiser takes from a bright capture is given back by further steps.
+    def less(image, sigma):
+        return image + jnp.minimum(sigma[..., None, None], 1) * (smooth(image, sigma) - image)
+
+    solver = tc.PlugAndPlay(less, iterations=5)
+    bright = tc.reconstruct(recording(noise=1e-4, told=1e-4), solver)
+    misfits = [2 * progress.objective / 238 for progress in bright.history]
+    assert 5 < bright.iterations < 10 and misfits[-1] < 10 < misfits[-2] < misfits[5]
     broken = tc.PlugAndPlay(lambda image, sigma: image * jnp.nan, iterations=3)
     result = tc.reconstruct(seen, broken)
     assert result.ending == "non_finite" and bool(jnp.isfinite(result.image).all())
