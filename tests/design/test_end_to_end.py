@@ -127,13 +127,32 @@ def prior_matrix():
     return np.real(both.conj().T @ np.diag(power.ravel()) @ both)
 
 
+def smooth(image, sigma):
+    """A denoiser: averages of three rows, the more the noisier; some pixels become negative."""
+    rows = (jnp.roll(image, 1, -2) + image + jnp.roll(image, -1, -2)) / 3
+    return image + sigma * (rows - image) - 0.3
+
+
+def dense_plug_and_play(information, right, start, truth):
+    brightness, found = (truth**3).sum() / (truth**2).sum(), start
+
+    def step(image, s):
+        matrix = information + np.eye(IMAGE**2) / s**2
+        return np.linalg.solve(matrix, right + image.ravel() / s**2).reshape(IMAGE, IMAGE)
+
+    for divisor in (6, 10, 15, 24):
+        s = brightness / divisor
+        found = np.maximum(smooth(step(found, s), s / 2), 0)
+    return np.maximum(step(found, s / 4), 0)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("noise", [SignalNoise(25.0), PhotonNoise(3000.0, 5.0)])
 def test_restored_are_the_best_linear_estimates(noise):
     given, chosen = training(noise), design()
     maps = dense(chosen, given)
     covariance = prior_matrix()
-    found = np.asarray(eqx.filter_jit(restore)(chosen, given))
+    found, steps = np.asarray(eqx.filter_jit(restore)(chosen, given)), []
     for image, drawn, restored in zip(given.images, given.noise, found, strict=True):
         flat = np.asarray(image).ravel()
         pairs = [maps[0] - maps[1], maps[2] - maps[3]]
@@ -146,15 +165,20 @@ def test_restored_are_the_best_linear_estimates(noise):
             right = right + pair.T @ captured / variance
         expected = np.linalg.solve(precision, right).reshape(IMAGE, IMAGE)
         np.testing.assert_allclose(restored, expected, rtol=0, atol=1e-7)
+        information = precision - np.linalg.inv(covariance)
+        steps.append(dense_plug_and_play(information, right, expected, np.asarray(image)))
     images = np.asarray(given.images)
     error = np.mean((found - images) ** 2, axis=(1, 2)) / np.var(images, axis=(1, 2))
     assert float(compiled_error(chosen, given)) == pytest.approx(error.mean(), rel=1e-9)
+    denoised = eqx.filter_jit(restore)(chosen, given.with_denoiser(smooth))
+    np.testing.assert_allclose(denoised, steps, rtol=0, atol=1e-7)
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("denoiser", [None, smooth])
 @pytest.mark.parametrize("noise", [SignalNoise(30.0), PhotonNoise(3000.0, 5.0)])
-def test_gradient_through_the_solver_by_differences(noise):
-    given = training(noise)
+def test_gradient_through_the_solver_by_differences(noise, denoiser):
+    given = training(noise) if denoiser is None else training(noise).with_denoiser(denoiser)
     place = jnp.array([9.0, 7.0, 5.03, 6.41, 5e-4, 1.83])
 
     @functools.partial(jax.jit, compiler_options=AS_IN_USE)

@@ -9,7 +9,19 @@ are restored as the best linear estimate under the prior η_f,
     = S \sum_c \frac{A_c^T g_c}{\sigma_c^2}, \qquad S = \eta_f^{1/2}
 
 by conjugate gradients. Their derivative is taken implicitly, at the solution, by another solve.
+
+With a denoiser D that estimate is the start of plug and play, as `thincam_jax.learn.PlugAndPlay`
+does it: with a deviation s of the prior that falls by steps,
+
+.. math:: \hat f \leftarrow D(z, s/2), \qquad
+    \Big(\sum_c \frac{A_c^T A_c}{\sigma_c^2} + \frac1{s^2}\Big) z
+    = \sum_c \frac{A_c^T g_c}{\sigma_c^2} + \frac{\hat f}{s^2}
+
+and a last z with half of the denoiser's σ as s. All steps are differentiated.
 """
+
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,9 +34,16 @@ from thincam_jax._core.precision import as_complex
 from thincam_jax.design.design import Design
 from thincam_jax.design.training import Channel, Training, channels_of, relative_error
 
+Image = Float[Array, "v u"]
+
+# s over the brightness of an image; the last data step has a quarter of the last of these.
+_DEVIATIONS = (1 / 6, 1 / 10, 1 / 15, 1 / 24)
+
 
 def end_to_end_error(design: Design, training: Training) -> Float[Array, ""]:
     """Squared error of the restored images, as a part of their variance, averaged.
+
+    With the training's denoiser, if it has one, of the images by plug and play.
 
     The PSNR in dB is −10·log₁₀ of this, up to a constant of the images. NaN where conjugate
     gradients did not reach the tolerance.
@@ -48,40 +67,68 @@ def restore_by(cameras: tuple[Channel, ...], training: Training) -> Float[Array,
 
     def one(image, noise):
         measured = [c.capture(image, n) for c, n in zip(cameras, noise, strict=True)]
-        return _estimate(cameras, measured, training)
+        captures = _Captures(cameras, measured, training)
+        found = captures.linear_estimate()
+        if training.denoiser is None:
+            return found
+        return captures.plug_and_play(found, training.denoiser, _brightness(image))
 
     return jax.vmap(one)(training.images, training.noise)
 
 
-def _estimate(cameras, measured, training: Training) -> Float[Array, "v u"]:
-    """The best linear estimate from (capture, variance) of each channel."""
-    image = training.images[0]
-    root = _prior_root(training)
+class _Captures:
+    """(capture, variance) of each camera, one image's."""
 
-    def shaped(x):
-        return jnp.fft.irfft2(jnp.fft.rfft2(x) * as_complex(root), s=x.shape)
+    def __init__(self, cameras: Sequence[Channel], measured: Sequence[Any], training: Training):
+        self.cameras, self.variances = cameras, [variance for _, variance in measured]
+        self.training, self.image = training, training.images[0]
+        self.right = self._back([capture for capture, _ in measured])
 
-    def back(captures):
-        total = jnp.zeros_like(image)
-        for camera, capture in zip(cameras, captures, strict=True):
-            total = total + jax.linear_transpose(camera, image)(capture)[0]
+    def linear_estimate(self) -> Image:
+        root = _prior_root(self.training)
+
+        def shaped(x):
+            return jnp.fft.irfft2(jnp.fft.rfft2(x) * as_complex(root), s=x.shape)
+
+        return shaped(
+            self._solved(lambda z: z + shaped(self._normal(shaped(z))), shaped(self.right))
+        )
+
+    def plug_and_play(self, image: Image, denoiser: Callable, brightness: Array) -> Image:
+        sigmas = [deviation / 2 * brightness for deviation in _DEVIATIONS]
+        for sigma in sigmas:
+            image = jnp.maximum(denoiser(self._data_step(image, 2 * sigma), sigma), 0)
+        return jnp.maximum(self._data_step(image, sigmas[-1] / 2), 0)
+
+    def _data_step(self, image: Image, s: Array) -> Image:
+        # The change is solved for: it is small, and so is the error that its tolerance leaves.
+        change = s**2 * (self.right - self._normal(image))
+        return image + self._solved(lambda x: x + s**2 * self._normal(x), change)
+
+    def _normal(self, image: Image) -> Image:
+        return self._back([camera(image) for camera in self.cameras])
+
+    def _back(self, captures: Sequence[Array]) -> Image:
+        total = jnp.zeros_like(self.image)
+        for camera, capture, v in zip(self.cameras, captures, self.variances, strict=True):
+            total = total + jax.linear_transpose(camera, self.image)(capture / v)[0]
         return total
 
-    def normal(z):
-        seen = [camera(shaped(z)) / v for camera, (_, v) in zip(cameras, measured, strict=True)]
-        return z + shaped(back(seen))
+    def _solved(self, matrix: Callable, right: Image) -> Image:
+        tolerance, steps = self.training.solver.tolerance, self.training.solver.steps
 
-    right = shaped(back([g / v for g, v in measured]))
+        def solve(matrix, b):
+            found, _ = cg(matrix, b, tol=tolerance, maxiter=steps)
+            left = jnp.linalg.norm(matrix(found) - b)
+            # The residual that is carried along is not quite this one.
+            return jnp.where(left <= 2 * tolerance * jnp.linalg.norm(b), found, jnp.nan)
 
-    solver = training.solver
+        return jax.lax.custom_linear_solve(matrix, right, solve, symmetric=True)
 
-    def solve(matrix, b):
-        found, _ = cg(matrix, b, tol=solver.tolerance, maxiter=solver.steps)
-        left = jnp.linalg.norm(matrix(found) - b)
-        # The residual that is carried along is not quite this one.
-        return jnp.where(left <= 2 * solver.tolerance * jnp.linalg.norm(b), found, jnp.nan)
 
-    return shaped(jax.lax.custom_linear_solve(normal, right, solve, symmetric=True))
+def _brightness(image: Image) -> Float[Array, ""]:
+    """Of what is bright in it."""
+    return jnp.sum(image**3) / jnp.sum(image**2)
 
 
 def _prior_root(training: Training) -> Float[Array, "v u"]:

@@ -11,6 +11,7 @@ captures and C the crop. `end_to_end` and `wiener` restore the images.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -95,7 +96,8 @@ class Training(eqx.Module):
     - `synthesis`: rows (channel) of weights of the captures; a row adds captures at one distance.
     - `field_shape`: of the projection on the sensor, at least the object's at the longest distance.
     - `distances`: mm; `window`: of the angles that a reconstruction's spectrum is taken over.
-    - `solver`: of `end_to_end`.
+    - `solver`: of `end_to_end`; `denoiser`: a function of images and their noise's deviation, with
+      which images are restored by plug and play, see `with_denoiser`.
     """
 
     images: Float[Array, "image v u"]
@@ -106,6 +108,7 @@ class Training(eqx.Module):
     distances: tuple[float, float] = eqx.field(static=True)
     window: Window = eqx.field(static=True)
     solver: ConjugateGradients = eqx.field(static=True)
+    denoiser: Any
 
     def __init__(
         self,
@@ -139,7 +142,11 @@ class Training(eqx.Module):
         self.field_shape = (rows, columns)
         self.distances = (float(distances[0]), float(distances[1]))
         self.window = _window(setup, max(sensor_shape), *distances)
-        self.solver = solver
+        self.solver, self.denoiser = solver, None
+
+    def with_denoiser(self, denoiser: Any) -> "Training":
+        """The training whose images are restored with a denoiser, such as `learn.Denoiser()`."""
+        return eqx.tree_at(lambda t: t.denoiser, self, denoiser, is_leaf=lambda x: x is None)
 
     @property
     def sensor(self) -> Sensor:

@@ -53,14 +53,16 @@ class TrainingError(AbstractObjective):
     """Error of training images; its data are `Training`.
 
     - `reconstruction`: "wiener", the Wiener synthesis; "linear", the best linear estimate, which
-      knows of the crop, by conjugate gradients.
+      knows of the crop, by conjugate gradients; "pnp", plug and play with the training's denoiser.
     """
 
     name: ClassVar[str] = "training_error"
     quantity: ClassVar[str] = "error of the training images over their variance"
-    reconstruction: Literal["wiener", "linear"] = "wiener"
+    reconstruction: Literal["wiener", "linear", "pnp"] = "wiener"
 
     def value(self, design: Design, data: Training) -> Float[Array, ""]:
+        if self.reconstruction == "pnp" and data.denoiser is None:
+            raise ValueError("reconstruction 'pnp' needs a denoiser; see Training.with_denoiser")
         error = wiener_error if self.reconstruction == "wiener" else end_to_end_error
         return error(design, data)
 

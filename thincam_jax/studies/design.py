@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -68,12 +68,14 @@ class TrainingPlan:
 
     - `images`: by name, (y, x) or (y, x, channel); their middle squares are taken.
     - `pixels`: of the sensor's shorter side; None: as many as the finest fringes need.
+    - `denoiser`: of the reconstruction "pnp", such as `learn.Denoiser()`.
     """
 
     images: Mapping[str, np.ndarray]
     error: TrainingError = TrainingError()
     settings: TrainingSettings = TrainingSettings()
     pixels: int | None = None
+    denoiser: Any = None
 
     def problem(
         self, searched: DesignProblem, sensor_shape: tuple[int, int], key: PRNGKeyArray
@@ -88,6 +90,8 @@ class TrainingPlan:
             pixels=self.pixels or training_pixels(space, setup, sensor_shape),
             key=key,
         )
+        if self.denoiser is not None:
+            training = training.with_denoiser(self.denoiser)
         return DesignProblem(self.error, cast(space, precision_of(jnp.zeros(()))), training)
 
 

@@ -28,6 +28,7 @@ from thincam_jax.design import (
 )
 from thincam_jax.design.objectives import OBJECTIVES
 from thincam_jax.imaging.targets import sample_image
+from thincam_jax.learn import Denoiser
 from thincam_jax.studies.design import DesignStudy, FrontPlan, TrainingPlan, as_method
 from thincam_jax.studies.study import Method, Study, Target, synthesis_matrix
 
@@ -153,6 +154,7 @@ def _training(config: DesignConfig) -> TrainingPlan | None:
         TrainingError(asked.reconstruction),
         TrainingSettings(asked.samples, asked.starts, asked.steps, config.search.grid),
         asked.pixels,
+        Denoiser() if asked.reconstruction == "pnp" else None,
     )
 
 

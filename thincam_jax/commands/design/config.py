@@ -245,7 +245,7 @@ class TrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))
 
     - `images`: photographs of scikit-image; their middle square is taken.
     - `reconstruction`: `wiener`, the Wiener synthesis as in the simulation; `linear`, the best
-      linear estimate, which knows of the crop, by conjugate gradients.
+      linear estimate, which knows of the crop; `pnp`, plug and play with the shipped denoiser.
     - `pixels`: of the sensor's shorter side in training; by default as many as the finest fringes
       need, and no more than the sensor has.
     - `samples`: even ones over the bounds; descents begin at the best `starts` of these, of the
