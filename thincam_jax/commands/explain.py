@@ -126,6 +126,10 @@ def rays(asked: Any, setup: Any) -> Iterator[str]:
     from thincam_jax.waveguide.system import entries_of_a_ray
 
     (rows, columns), parts = asked.sensor.shape, asked.band_samples or 1
+    if getattr(asked, "mask", None) is not None:
+        size = rows * columns * asked.object.cells[0] * asked.object.cells[1]
+        yield f"matrix of each model: {size / 1e6:.3g} million entries, {readable(4 * size)}"
+        return
     cameras = build_cameras(asked) if setup is None else setup.cameras
     plane = build_plane(asked) if setup is None else setup.plane
     traced = rows * columns * asked.orders * parts * len(cameras)

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pydantic
 from pydantic import Field
@@ -100,6 +100,7 @@ class MaskConfig(
       PSFs are by "angular_spectrum".
     """
 
+    beside: ClassVar[tuple[str, ...]] = ()  # keys of a section that are not of the mask itself
     width: Length = 0.0
     family: Family = "fza"
     length: int | None = None
@@ -116,7 +117,7 @@ class MaskConfig(
 
     @pydantic.model_validator(mode="after")
     def _family_fits(self):
-        known = {"pixel_pitch", "fill_factor", "family", "width"}
+        known = {"pixel_pitch", "fill_factor", "family", "width", *self.beside}
         for name, parameter in inspect.signature(FAMILIES[self.family]).parameters.items():
             for key in _MADE_OF.get(name, (name,)):
                 known.add(key)

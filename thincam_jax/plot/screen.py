@@ -13,8 +13,26 @@ from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.pictures import Reconstructed
 from thincam_jax.studies.rig import ShownPictures
 from thincam_jax.studies.screen import ScreenResult, ScreenStudy
-from thincam_jax.studies.screen_calibration import CalibrationResult
+from thincam_jax.studies.screen_calibration import CalibrationResult, diagonal_cells
+from thincam_jax.studies.screen_mask import MaskSystem
 from thincam_jax.units import nm
+
+_RAYS = (
+    "Side view: rays of three pixels through {}, plate (grey) and out to the object; thin lines "
+    "go on to the object points of the image and its ghosts, further down with each bounce."
+)
+_FIELD = (
+    "Each pixel is reached by one colour, and its ghosts have a shift of their own: no convolution "
+    "describes this camera."
+)
+_SHADOWS = (
+    "What the sensor sees of single cells (row, column): the mask's shadow, once for each order of "
+    "the screen, at its own place."
+)
+COLUMNS_CAPTION = (
+    "What the sensor sees of single cells (row, column): columns of the measured matrix, and of "
+    "the exact one."
+)
 
 # Centres, widths below and above (nm) and heights of lobes whose sums are the CIE 1931 matching
 # functions x, y, z to about 1 % (Wyman, Sloan and Shirley, JCGT 2(2), 2013).
@@ -50,6 +68,37 @@ def in_colour(capture: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     return encoded[::-1, ::-1]
 
 
+def draw_result(result: ScreenResult, rays: wg.Rays) -> dict[str, Figure]:
+    """All figures of a study, by the name of their file."""
+    study, system = result.study, result.study.systems[0]
+    if isinstance(system, MaskSystem):
+        cells, sensor = diagonal_cells(study.plane.shape), study.camera.sensor
+        numbers = np.ravel_multi_index(tuple(np.transpose(cells)), study.plane.shape)
+        shadows = np.asarray(system.matrix)[:, numbers].T.reshape(-1, *sensor.shape)
+        field = draw_columns(float(sensor.pitch), cells, {"shadows": shadows}, "mm² of aperture")
+    else:
+        field = draw_field(study, rays)
+    return {
+        "rays": draw_rays(study),
+        "field": field,
+        "images": draw_images(result),
+        "models": draw_models(result),
+        "errors": draw_errors(result),
+    }
+
+
+def captions(study: ScreenStudy) -> dict[str, str]:
+    """Of the figures of a study, by their names."""
+    lens = study.mask is None
+    turned = "in the colours of its pixels, turned upright" if lens else "turned upright"
+    return {
+        "rays": _RAYS.format("lens" if lens else "the middle of the mask"),
+        "field": _FIELD if lens else f"{_SHADOWS} {study.systems[0]}",
+        "images": f"Targets, what the sensor captures ({turned}), and reconstructions with the "
+        f"model “{study.models[0].name}”.",
+    }
+
+
 def draw_rays(study: ScreenStudy) -> Figure:
     """Side view: rays of three pixels from the sensor through the plate to its front."""
     camera, screen = study.camera, study.camera.screen
@@ -82,7 +131,8 @@ def draw_rays(study: ScreenStudy) -> Figure:
             line.append((start + width + ahead, out + ahead * slopes[n]))
             ax.plot(*zip(*line, strict=True), linewidth=0.8, **style)
     ax.axvspan(start, start + width, color="0.9")
-    ax.axvline(d0, color="0.6", linewidth=4, label="lens")
+    kind = "lens" if study.mask is None else "middle of the mask"
+    ax.axvline(d0, color="0.6", linewidth=4, label=kind)
     ax.set(xlabel="z from the sensor (mm)", ylabel="y, down the screen (mm)")
     ax.set_xlim(0, start + width + ahead)
     ax.invert_yaxis()
@@ -119,9 +169,12 @@ def draw_field(study: ScreenStudy, rays: wg.Rays) -> Figure:
 def draw_images(result: ScreenResult, figure: Figure | None = None) -> Figure:
     """Targets, captures, and what the first model reconstructs by every solver."""
     study, (first, *_) = result.study, result.models.items()
-    captures, light = np.asarray(study.captures.images), study.wavelengths
-    colours = [in_colour(capture, light) for capture in captures]
-    columns = [("capture, turned", colours, [""] * len(colours))]
+    captures = np.asarray(study.captures.images)
+    if study.mask is None:
+        seen = [in_colour(capture, study.wavelengths) for capture in captures]
+    else:  # light of all colours in every pixel
+        seen = [one[::-1, ::-1] / np.percentile(one, 99.8) for one in captures]
+    columns = [("capture, turned", seen, [""] * len(seen))]
     columns += [(name, list(one.images), _labels(one)) for name, one in first[1].methods.items()]
     return _sheet(study.targets, columns, figure)
 
@@ -192,10 +245,20 @@ def draw_errors(result: ScreenResult) -> Figure:
     return figure
 
 
+def draw_calibration(result: CalibrationResult) -> dict[str, Figure]:
+    """Figures of a calibration, by the name of their file."""
+    pitch = float(result.study.camera.sensor.pitch)
+    figures = {"columns": draw_columns(pitch, result.cells, result.columns)}
+    return figures | ({"distances": draw_distances(result)} if result.images else {})
+
+
 def draw_columns(
-    pitch: float, cells: list[tuple[int, int]], images: Mapping[str, np.ndarray]
+    pitch: float,
+    cells: list[tuple[int, int]],
+    images: Mapping[str, np.ndarray],
+    unit: str = "counts for a white cell",
 ) -> Figure:
-    """Captures (cell, y, x) of some cells (row, column) alone, in counts, on pixels of a pitch, mm.
+    """Captures (cell, y, x) of some cells (row, column) alone, in a unit, on pixels of a pitch, mm.
 
     The grey goes with the square root, so that ghosts are seen beside the image.
     """
@@ -211,7 +274,7 @@ def draw_columns(
         line[0].set_ylabel("y on the sensor (mm)")
     for ax in grid[-1]:
         ax.set_xlabel("x on the sensor (mm)")
-    figure.colorbar(grid[0, 0].images[0], ax=grid, label="counts for a white cell")
+    figure.colorbar(grid[0, 0].images[0], ax=grid, label=unit)
     return figure
 
 

@@ -37,6 +37,7 @@ from .screen import ScreenStudy as ScreenStudy
 from .screen_calibration import Calibration as Calibration
 from .screen_calibration import CalibrationResult as CalibrationResult
 from .screen_calibration import calibrate as calibrate
+from .screen_mask import ScreenMask as ScreenMask
 from .simulate import Capture as Capture
 from .simulate import expose as expose
 from .simulate import noise_free as noise_free

@@ -17,6 +17,11 @@ from thincam_jax.imaging.operators import AbstractOperator
 from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Recording, reconstruct
 from thincam_jax.studies.evaluate import rounded
 
+PUBLISHED = (
+    "Ours are simulated, the published ones measured: the differences are those of the two, not of "
+    "the methods. Times are with compilation, all images together."
+)
+
 
 class ScreenCaptures(eqx.Module):
     """Captures (target, *channel, y, x), or reduced ones, and the variance of their noise."""
@@ -114,17 +119,17 @@ def beside(
     - `found`: by solver. `published`: by target and solver; either may be missing.
     """
     methods = {name: one.scores for name, one in found.items()}
-    rows = []
+    others, rows = (list(methods) if any(published.values()) else []), []
     for target in next(iter(methods.values())).targets:
         own = [scores.targets[target] for scores in methods.values()]
-        stated = [published.get(target, {}).get(name, PublishedImage()) for name in methods]
-        others = (number for one in stated for number in (one.psnr_db, one.seconds))
-        rows.append((target, *(n for one in own for n in (one.psnr_db, one.ssim)), *others))
+        stated = [published.get(target, {}).get(name, PublishedImage()) for name in others]
+        theirs = (number for one in stated for number in (one.psnr_db, one.seconds))
+        rows.append((target, *(n for one in own for n in (one.psnr_db, one.ssim)), *theirs))
     seconds = (t for s in methods.values() for t in (f"{s.seconds_per_image:.2f}", ""))
-    rows.append(("time for an image, s", *seconds, *[""] * (2 * len(methods))))
+    rows.append(("time for an image, s", *seconds, *[""] * (2 * len(others))))
     ours = (heading for name in methods for heading in (f"{name}\nPSNR dB", "SSIM"))
-    theirs = (h for name in methods for h in (f"published\n{name}, dB", "published\ns"))
-    count = 2 * len(methods)
-    digits = (*(1, 3) * len(methods), *(1,) * count)
-    columns = range(count + 1, 2 * count + 1)
+    theirs = (h for name in others for h in (f"published\n{name}, dB", "published\ns"))
+    count, more = 2 * len(methods), 2 * len(others)
+    digits = (*(1, 3) * len(methods), *(1,) * more)
+    columns = range(count + 1, count + more + 1)
     return Table(("target", *ours, *theirs), rows, digits, published=columns)

@@ -7,7 +7,7 @@ capture is a sum of ghosts, whose shifts and weights differ from pixel to pixel 
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -21,7 +21,8 @@ from thincam_jax import waveguide as wg
 from thincam_jax._core.quantity import check_fields, choice, quantity
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
-from thincam_jax.imaging.operators import Sparse
+from thincam_jax.imaging.operators import AbstractOperator, Sparse
+from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.imaging.sensor import AbstractNoise, electrons_per_unit, read_out
 from thincam_jax.reconstruction import AbstractSolver
 from thincam_jax.studies.pictures import (
@@ -31,6 +32,7 @@ from thincam_jax.studies.pictures import (
     beside,
     reconstructed,
 )
+from thincam_jax.studies.screen_mask import MaskSystem, ScreenMask, require_mask_fits
 from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.hologram import directions
 from thincam_jax.waveguide.rays import bragg_rays
@@ -91,6 +93,7 @@ class ScreenStudy:
     - `orders`: of ghosts; `band_samples`: as of `waveguide.system_operator`.
     - `recording_angles`: of the object and the reference wave in the film, rad, which the mistake
       "grating" needs.
+    - `mask`: in the place of the lens, before a bare sensor; None for the lens.
     - `config`: the sections of the file that it was read from, if any.
 
     ```python
@@ -128,7 +131,13 @@ class ScreenStudy:
     recording_angles: tuple[float, float] | None = None
     seed: int = 0
     name: str = "screen"
+    mask: ScreenMask | None = None
     config: Any = field(default=None, repr=False)
+
+    def __post_init__(self):
+        if self.mask is not None:
+            mistakes, tilt = [model.mistake for model in self.models], np.asarray(self.camera.tilt)
+            require_mask_fits(mistakes, len(self.cameras), self.band_samples, tilt.tolist())
 
     @property
     def camera(self) -> wg.SeeThroughCamera:
@@ -166,12 +175,15 @@ class ScreenStudy:
             )
 
     @cached_property
-    def systems(self) -> list[Sparse]:
-        """The matrix of each model.
+    def systems(self) -> list[Sparse | MaskSystem]:
+        """The operator of each model.
 
-        All have as many entries as the largest, the others in no pixel, for one compiled program.
+        Matrices all have as many entries as the largest, the others in no pixel, for one compiled
+        program.
         """
         systems = [self.system(model) for model in self.models]
+        if self.mask is not None:
+            return systems
         most = max(system.values.size for system in systems)
         outside = math.prod(systems[0].out_shape), math.prod(systems[0].in_shape)
 
@@ -185,11 +197,13 @@ class ScreenStudy:
 
         return [padded(system) for system in systems]
 
-    def system(self, model: ScreenModel) -> Sparse:
-        """The matrix of one model, from the cells to the sensor."""
+    def system(self, model: ScreenModel) -> Sparse | MaskSystem:
+        """The matrix of one model, or its operator, from the cells to the sensor."""
         cameras = self.cameras
         if model.glass_thickness is not None:
             cameras = [with_glass(camera, model.glass_thickness) for camera in cameras]
+        if self.mask is not None:
+            return self.mask.system(cameras[0], self.plane, self.orders, model.mistake)
         channels = []
         for camera in cameras:
             rays = mistaken_rays(self, camera, model.mistake)
@@ -203,11 +217,11 @@ class ScreenStudy:
         """Every target as the sensor reads it."""
         return self.captured_through(self.systems[0])
 
-    def captured_through(self, system: Sparse) -> ScreenCaptures:
+    def captured_through(self, system: AbstractOperator) -> ScreenCaptures:
         """Every target as the sensor of a camera with that matrix reads it."""
         images = np.stack(list(self.targets.values()))
         images = np.moveaxis(images, -1, 1) if images.ndim == 4 else images
-        images = jnp.asarray(images.reshape(-1, *system.in_shape), system.values.dtype)
+        images = jnp.asarray(images.reshape(-1, *system.in_shape), dtype_of(system))
         clean, sensor = system(images), self.camera.sensor
         keys = [jax.random.fold_in(jax.random.key(self.seed), n) for n in range(len(images))]
         read = [
@@ -298,6 +312,16 @@ class ScreenResult:
         ]
         headings = ("model", *(f"{name}, mean dB" for name in self.study.solvers))
         return Table(headings, rows, (1,) * len(self.study.solvers))
+
+    def metrics(self, rays: "RaySummary") -> dict[str, Any]:
+        """Ranges of the rays, scores of every model by every solver, and the system's entries."""
+        system, models = self.study.systems[0], {}
+        for name, model in self.models.items():
+            methods = {solver: asdict(one.scores) for solver, one in model.methods.items()}
+            models[name] = {"mistake": model.mistake, "methods": methods}
+        size = (system.matrix if isinstance(system, MaskSystem) else system.values).size
+        known = {name: value for name, value in asdict(rays).items() if value is not None}
+        return {"rays": known, "models": models, "entries_of_the_system": int(size)}
 
     @property
     def right(self) -> ModelResult:

@@ -196,3 +196,50 @@ def test_the_shipped_file(tmp_path):
     (camera,) = build_cameras(shipped)
     status = wg.trace(camera, jnp.zeros(2), 550.0, 4).status
     assert status.tolist() == [0, 0, 0, wg.RayStatus.OFF_HOLOGRAM]  # of the thesis' size
+
+
+MASK = "mask: {beta: 6 rad/mm^2, width: 1.4 mm, distance: 6.5 mm, gap: 0.5 mm, points: 3}"
+WITH_MASK = re.sub(r"calibration:.*?(?=targets:)", "", tiny.TEXT, flags=re.DOTALL)
+for _lens, _mask in (
+    ("lens: {focal_distance: 6 mm, lens_distance: 10 mm}", MASK),
+    ("{shape: [22, 30], pitch: 70.4 um}", "{shape: [24, 32], pitch: 130 um}"),
+    ("distance: 550 mm, width: 120 mm, y: 27 mm", "distance: 550 mm, width: 150 mm, y: 9 mm"),
+    ("band_samples: 3\n", ""),
+):
+    assert _lens in WITH_MASK
+    WITH_MASK = WITH_MASK.replace(_lens, _mask)
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("lens={focal_distance: 6 mm, lens_distance: 10 mm}", "mask: give a lens, or a mask in"),
+        ("mask=null", "mask: give a lens, or a mask in its place"),
+        ("calibration={bits: 10}", "calibration: measures a camera with a lens; drop it"),
+        ("band_samples=3", "band_samples: the smear of the band is left out behind a mask; drop"),
+        ("screen.tilt=[1 deg, 0 deg]", "screen.tilt: a mask is parallel to the plate; drop"),
+        ("models.1.mistake=grating", "models[1].mistake: 'grating' is of a camera with a lens; ch"),
+        ("mask.focal_distance=6 mm", "mask.focal_distance: unknown key; allowed here: width"),
+        ("mask.points=4", "mask.points: points = 4 is even; give 5"),
+        ("mask={width: 1.4 mm, distance: 6 mm, gap: 1 mm}", "mask.beta: missing; this key is"),
+    ],
+)
+def test_what_does_not_hold_behind_a_mask_is_refused_in_one_line(override, part, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        tiny.experiment(tmp_path, override, text=WITH_MASK)
+    (line,) = str(caught.value).split("\n")
+    assert part in line
+
+
+@pytest.mark.thorough
+def test_a_file_with_a_mask_in_place_of_the_lens(tmp_path):
+    """The right model is the best one, and the page says what stands before the sensor."""
+    config = tiny.experiment(tmp_path, text=WITH_MASK)
+    assert tiny.experiment(tmp_path, text=dump_config(config)) == config
+    result = run_screen(build_screen(config), RunFolder(tmp_path / "out"), Told())
+    means = {name: mean for name, mean, _ in result.table().rows}
+    assert means["right"] > max(means["convolution"], means["single"]) + 1.5
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "1.4 mm (cosine), 6.5 mm before it" in page and "the mask's shadow, once" in page
+    assert {p.stem for p in (tmp_path / "out/figures").iterdir()} == set(PICTURES[:5])
+    assert stored(tmp_path / "out")["entries_of_the_system"] == 24 * 32 * 8 * 16

@@ -14,8 +14,7 @@ from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen.run import PUBLISHED, build_cameras, build_plane, published_figures
-from thincam_jax.commands.screen.run import build_solver as build_solver_of
+from thincam_jax.commands.screen.run import build_cameras, build_plane, published_figures
 from thincam_jax.commands.sections import PHASES, PictureConfig, SensorConfig, build_solver
 from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
@@ -24,7 +23,7 @@ from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import write_image
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
-from thincam_jax.studies.pictures import beside, finding
+from thincam_jax.studies.pictures import PUBLISHED, beside, finding
 from thincam_jax.studies.rig import (
     FrameAgreement,
     MatrixAgreement,
@@ -141,7 +140,7 @@ class _CaptureRun(Run):
         config, seen = self.config, self.taken.seen
         try:
             known = calibrated(Path(config.matrix or ""), self.folder.path)
-            solvers = {method.name: build_solver_of(method) for method in config.methods}
+            solvers = {method.name: method.build() for method in config.methods}
             shown = {name: levels / 255 for name, levels in picture_levels(config).items()}
             asked = shown or {"scene": None}
             found = reconstruct_pictures(asked, seen.frames, known, solvers, seen.variance)

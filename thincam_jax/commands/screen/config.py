@@ -1,14 +1,15 @@
 """Experiment files of `kind: screen`: a camera behind a glass plate with two holograms."""
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 from pydantic import Field
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import Angle, Length, Section, Wavelength, section
+from thincam_jax.commands.mask import MaskConfig
+from thincam_jax.commands.schema import Angle, Curvature, Length, Section, Wavelength, section
 from thincam_jax.commands.sections import (
     ExperimentConfig,
     Name,
@@ -20,11 +21,12 @@ from thincam_jax.commands.sections import (
     check_names,
 )
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
-from thincam_jax.reconstruction import Ridge
+from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
 from thincam_jax.studies.pictures import PublishedImage
 from thincam_jax.studies.refocus import SceneObject
 from thincam_jax.studies.screen import ScreenModel
 from thincam_jax.studies.screen_calibration import MEASURED, Calibration
+from thincam_jax.studies.screen_mask import ScreenMask, require_mask_fits
 from thincam_jax.studies.study import check_noise
 
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
@@ -82,6 +84,18 @@ class LensConfig(section(wg.SeeThroughCamera, only=("focal_distance", "lens_dist
     """From sensor to lens (d0), and from lens to the plate (d1)."""
 
 
+class ScreenMaskConfig(section(ScreenMask, without=("mask",)), MaskConfig):
+    """A mask before a bare sensor, in place of the lens, and how its PSFs are computed.
+
+    - `beta`: of a zone plate. `distance`: from sensor to mask; `gap`: from the mask to the plate.
+    """
+
+    beside: ClassVar[tuple[str, ...]] = ("distance", "gap", "model", "points", "tolerance")
+    beta: Curvature | None = None
+    distance: Length
+    gap: Length
+
+
 def check_cells(cells: tuple[int, int], *place: str) -> None:
     """Refuse cells that there are no Hadamard patterns of."""
     try:
@@ -109,6 +123,14 @@ class ScreenMethodConfig(section(Ridge, only=("ridge",), defaults={"ridge": None
         if getattr(self, other) is not None:
             raise FieldError(f"kind {self.kind} does not take it; drop {other!r}", other)
         return self
+
+    def build(self, *_: Any, **others: Any) -> AbstractSolver:
+        """The solver."""
+        if self.kind == "ridge":
+            return Ridge(self.ridge or 1.0)
+        options = self.variation or VariationConfig()
+        variation = TotalVariation(options.kind)
+        return AdmmTV(options.tau, variation=variation, iterations=options.iterations)
 
 
 class ModelConfig(section(ScreenModel, without=("name",))):
@@ -149,14 +171,22 @@ class SeeThroughConfig(Section):
     orders: Annotated[int, Field(ge=1, le=16)] = 4
     band_samples: Annotated[int, Field(ge=1, le=64)] | None = None
 
+    @property
+    def distances(self) -> tuple[float, float]:
+        """From the sensor to the lens or mask, and from there to the plate, mm."""
+        return self.lens.focal_distance, self.lens.lens_distance
+
 
 class ScreenConfig(SeeThroughConfig, ExperimentConfig):
     """Captures through a see-through screen, undone with right and wrong models of it.
 
+    - `mask`: in place of the lens.
     - `calibration`: measures the camera of the first model, and reconstructs with that matrix too.
     """
 
     kind: Literal["screen"]
+    lens: LensConfig | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    mask: ScreenMaskConfig | None = None
     noise: NoiseConfig
     methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
     models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
@@ -167,6 +197,13 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
     @pydantic.model_validator(mode="after")
     def _fits(self):
         check_names(self, "methods", "models", "targets")
+        if (self.lens is None) == (self.mask is None):
+            raise FieldError("give a lens, or a mask in its place", "mask")
+        if self.mask is not None:
+            if self.calibration is not None:
+                raise FieldError("measures a camera with a lens; drop it", "calibration")
+            mistakes, colours = [model.mistake for model in self.models], self.hologram.recorded
+            require_mask_fits(mistakes, len(colours), self.band_samples, self.screen.tilt)
         if self.calibration is not None:
             if self.hologram.colours is not None:
                 message = "takes a hologram of one colour; drop hologram.colours"
@@ -182,3 +219,7 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
                 check_known(name, "method", methods, "targets", number, "published", name)
         check_noise(self.sensor.build(), self.noise.build())
         return self
+
+    @property
+    def distances(self) -> tuple[float, float]:
+        return (self.mask.distance, self.mask.gap) if self.mask else super().distances

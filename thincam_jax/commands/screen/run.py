@@ -15,15 +15,13 @@ from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.config import (
     CalibrationConfig,
     ScreenConfig,
-    ScreenMethodConfig,
     ScreenTargetConfig,
     SeeThroughConfig,
 )
-from thincam_jax.commands.sections import VariationConfig
-from thincam_jax.commands.study.build import picture
+from thincam_jax.commands.study.build import build_optics, picture
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import screen as plot
-from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
-from thincam_jax.studies.pictures import finding
+from thincam_jax.studies.pictures import PUBLISHED, finding
 from thincam_jax.studies.screen import (
     ModelResult,
     RaySummary,
@@ -33,23 +31,7 @@ from thincam_jax.studies.screen import (
     summarise_rays,
 )
 from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun, CalibrationScores
-
-_RAYS = (
-    "Side view: rays of three pixels through lens, plate (grey) and out to the object; thin lines "
-    "go on to the object points of the image and its ghosts, further down with each bounce."
-)
-_FIELD = (
-    "Each pixel is reached by one colour, and its ghosts have a shift of their own: no convolution "
-    "describes this camera."
-)
-PUBLISHED = (
-    "Ours are simulated, the published ones measured: the differences are those of the two, not of "
-    "the methods. Times are with compilation, all images together."
-)
-_COLUMNS = (
-    "What the sensor sees of single cells (row, column): columns of the measured matrix, and of "
-    "the exact one."
-)
+from thincam_jax.studies.screen_mask import ScreenMask
 
 
 def build_screen(config: ScreenConfig) -> ScreenStudy:
@@ -67,13 +49,14 @@ def build_screen(config: ScreenConfig) -> ScreenStudy:
         build_plane(config),
         targets,
         config.noise.build(),
-        {method.name: build_solver(method) for method in config.methods},
+        {method.name: method.build() for method in config.methods},
         tuple(model.build(name=model.name) for model in config.models),
         config.orders,
         config.band_samples,
         (config.hologram.object_angle, config.hologram.reference_angle),
         config.seed,
         config.name,
+        build_mask(config),
         config,
     )
     try:
@@ -85,6 +68,14 @@ def build_screen(config: ScreenConfig) -> ScreenStudy:
     return study
 
 
+def build_mask(config: ScreenConfig) -> ScreenMask | None:
+    """The mask in the lens' place, if there is one."""
+    if (asked := config.mask) is None:
+        return None
+    numbers = asked.beta or 0.0, 0.0, asked.distance, config.hologram.recorded[0], asked.width
+    return asked.build(mask=build_optics(asked, config.sensor, Exposure(*numbers))[0])
+
+
 def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
     """The cells before the camera."""
     seen = config.object
@@ -93,32 +84,15 @@ def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
 
 def build_cameras(config: SeeThroughConfig) -> tuple[wg.SeeThroughCamera, ...]:
     """The camera of each colour."""
-    return tuple(_camera(config, wavelength) for wavelength in config.hologram.recorded)
-
-
-def _camera(config: SeeThroughConfig, wavelength: float) -> wg.SeeThroughCamera:
-    film, plate = config.hologram, config.screen
-    hologram = film.build(wavelength=wavelength).processed(film.shrinkage)
-    screen = wg.Screen(
-        hologram,
-        plate.glass_thickness,
-        plate.glass_index,
-        plate.top and plate.top.build(),
-        plate.bottom and plate.bottom.build(),
-    )
-    lens = config.lens
-    sensor = config.sensor.build()
-    distances = lens.focal_distance, lens.lens_distance
-    return wg.SeeThroughCamera(screen, sensor, *distances, tilt=np.asarray(plate.tilt))
-
-
-def build_solver(method: ScreenMethodConfig) -> AbstractSolver:
-    """The solver of a method of a file."""
-    if method.kind == "ridge":
-        return Ridge(method.ridge or 1.0)
-    options = method.variation or VariationConfig()
-    variation = TotalVariation(options.kind)
-    return AdmmTV(options.tau, variation=variation, iterations=options.iterations)
+    film, plate, cameras = config.hologram, config.screen, []
+    holograms = {"top": plate.top and plate.top.build()}
+    holograms["bottom"] = plate.bottom and plate.bottom.build()
+    others = config.sensor.build(), *config.distances, np.asarray(plate.tilt)
+    for wavelength in film.recorded:
+        hologram = film.build(wavelength=wavelength).processed(film.shrinkage)
+        screen = wg.Screen(hologram, plate.glass_thickness, plate.glass_index, **holograms)
+        cameras.append(wg.SeeThroughCamera(screen, *others))
+    return tuple(cameras)
 
 
 def run_screen(study: ScreenStudy, folder: RunFolder, progress: Progress) -> ScreenResult:
@@ -150,30 +124,13 @@ class _ScreenRun(Run):
             found[MEASURED] = ModelResult("by Hadamard patterns, with noise", calibrated.methods)
         result = self.result = ScreenResult(study, found)
         summary = summarise_rays(study, rays)
-        ranges = {name: value for name, value in asdict(summary).items() if value is not None}
         memory = round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2)
-        self.metrics = {
-            "study": study.name,
-            "kind": self.config.kind,
-            "seed": study.seed,
-            "rays": ranges,
-            "models": {name: _scores(model) for name, model in found.items()},
-            "entries_of_the_system": int(study.systems[0].values.size),
-            "peak_memory_gb": memory,
-        }
-        drawn = {
-            "rays": plot.draw_rays(study),
-            "field": plot.draw_field(study, rays),
-            "images": plot.draw_images(result),
-            "models": plot.draw_models(result),
-            "errors": plot.draw_errors(result),
-        }
+        kind = {"study": study.name, "kind": self.config.kind, "seed": study.seed}
+        self.metrics = kind | result.metrics(summary) | {"peak_memory_gb": memory}
+        drawn = plot.draw_result(result, rays)
         if calibrated is not None:
             self.metrics["calibration"] = asdict(calibrated.scores)
-            pitch = float(study.camera.sensor.pitch)
-            drawn["columns"] = plot.draw_columns(pitch, calibrated.cells, calibrated.columns)
-            if calibrated.images:
-                drawn["distances"] = plot.draw_distances(calibrated)
+            drawn |= plot.draw_calibration(calibrated)
         for name, figure in drawn.items():
             self.folder.save_figure(name, figure)
         for name, one in found[study.models[0].name].methods.items():
@@ -181,11 +138,6 @@ class _ScreenRun(Run):
                 self.folder.save_image(f"{slug(target)}--{slug(name)}", np.asarray(image))
         scores = None if calibrated is None else calibrated.scores
         self.complete(page(self.config, result, summary, scores, memory))
-
-
-def _scores(model: ModelResult) -> dict[str, Any]:
-    methods = {name: asdict(one.scores) for name, one in model.methods.items()}
-    return {"mistake": model.mistake, "methods": methods}
 
 
 def published_figures(targets: Sequence[ScreenTargetConfig]) -> dict[str, dict[str, Any]]:
@@ -204,19 +156,20 @@ def page(
     peak: float,
 ) -> Page:
     """The page of a finished run; `peak`: the most memory it took, GB."""
-    right, last = config.models[0].name, config.methods[-1].name
+    last = config.methods[-1].name
     published = published_figures(config.targets)
-    images = (
-        "Targets, what the sensor captures (in the colours of its pixels, turned upright), and "
-        f"reconstructions with the model “{right}”."
-    )
+    mask, captions = config.mask, plot.captions(result.study)
+    behind = "" if mask is None else f"{mask.label}, {mask.distance:g} mm before it, "
     lead = (
-        f"{pixels_of(config.sensor)} behind a glass of {config.screen.glass_thickness:g} mm; "
-        f"{config.object.cells[0]}×{config.object.cells[1]} cells at {config.object.distance:g} "
-        f"mm, {config.orders} ghost orders, seed {config.seed}. {peak:.1f} GB of memory at most.",
-        Picture("images.png", "Targets, captures, reconstructions", images),
-        Picture("rays.png", "Rays in side view", _RAYS),
-        Picture("field.png", "Wavelength and ghost shifts over the field", _FIELD),
+        f"{pixels_of(config.sensor)}, {behind}behind a glass of {config.screen.glass_thickness:g} "
+        f"mm; {config.object.cells[0]}×{config.object.cells[1]} cells at "
+        f"{config.object.distance:g} mm, {config.orders} ghost orders, seed {config.seed}. "
+        f"{peak:.1f} GB of memory at most.",
+        Picture("images.png", "Targets, captures, reconstructions", captions["images"]),
+        Picture("rays.png", "Rays in side view", captions["rays"]),
+        Picture(
+            "field.png", "Wavelengths, ghost shifts or shadows over the field", captions["field"]
+        ),
         str(rays),
     )
     scored = f"PSNR after a least-squares gain and offset, by {last}."
@@ -228,8 +181,10 @@ def page(
     calibrated = ()
     if calibration is not None and config.calibration is not None:
         calibrated = _calibration(config, config.calibration, calibration)
+    titles = "Beside the thesis' Table 5.1", PUBLISHED
+    beside, note = titles if any(published.values()) else ("Pictures", "")
     parts = (
-        Part("Beside the thesis' Table 5.1", (result.published_table(published), PUBLISHED)),
+        Part(beside, (result.published_table(published), note)),
         Part("What an error of the model costs", errors, "Errors of the model"),
         Part("Calibration with Hadamard patterns", calibrated, "Calibration"),
         Part("Notes", config.notes),
@@ -251,7 +206,7 @@ def _calibration(
         f"largest entry of the matrix is {found.largest_counts:.0f} counts; its noise is "
         f"{found.noise_counts:.3f}, expected of the frames' {found.expected_noise_counts:.3f}. "
         "“measured matrix” in the tables above is a reconstruction with it.",
-        Picture("columns.png", "Columns of the matrix", _COLUMNS),
+        Picture("columns.png", "Columns of the matrix", plot.COLUMNS_CAPTION),
         f"The screen fitted to it: {found.fit.status.replace('_', ' ')}{reasons}.",
         found.fit.table(),
         found.table(),

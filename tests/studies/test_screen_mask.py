@@ -1,0 +1,60 @@
+"""A mask in place of a screen's lens: its matrix against rays through every part of the mask."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from studies import tiny_screen
+from waveguide.test_screen_to_sensor import OBJECT, ORDERS, behind, mask, traced
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax import waveguide as wg
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.studies.screen import ScreenModel
+from thincam_jax.studies.screen_mask import ScreenMask, first_image
+
+PLANE = wg.ObjectPlane((18, 24), OBJECT, 150.0, (6.0, 12.0))
+
+
+def test_cells_are_carried_to_their_first_image():
+    """Off the axis and of a non-square plane: each sample reads its traced point's cell."""
+    camera = behind()
+    matrix, field = first_image(camera, PLANE)
+    rows, columns = np.mgrid[: PLANE.shape[0], : PLANE.shape[1]]
+    x, y = ((n - (c - 1) / 2) * float(PLANE.pitch) for n, c in ((columns, 24), (rows, 18)))
+    ends = [(n - 1) / 2 * float(camera.sensor.pitch) for n in field]
+    v, u = np.meshgrid(*(np.linspace(-e, e, n) for e, n in zip(ends, field, strict=True)))
+    pixels = jnp.asarray(np.stack([v, u], axis=-1).transpose(1, 0, 2)[..., ::-1])
+    seen = np.asarray(wg.trace(camera, pixels, OBJECT, 1).points)[0, ..., :2]
+    inside = np.abs(seen - np.asarray(PLANE.centre)) < np.array([62.0, 43.0])
+    for axis, place in enumerate((x, y)):
+        found = (matrix @ place.ravel()).reshape(field) + float(PLANE.centre[axis])
+        assert np.abs(found - seen[..., axis])[inside.all(axis=-1)].max() < 0.1 * float(PLANE.pitch)
+    assert float(matrix.sum(axis=0).min()) > 0.3 * float(matrix.sum(axis=0).max())
+
+
+@pytest.mark.thorough
+def test_matrix_against_rays_through_every_part_of_the_mask():
+    camera, image = behind(), np.random.default_rng(0).random((9, 12)).repeat(2, 0).repeat(2, 1)
+    middle, half = np.asarray(PLANE.centre), np.array([24, 18]) / 2
+
+    def scene(points):
+        x, y = np.floor((points - middle) / float(PLANE.pitch) + half).astype(int).T
+        inside = (x >= 0) & (x < 24) & (y >= 0) & (y < 18)
+        return np.where(inside, image[np.clip(y, 0, 17), np.clip(x, 0, 23)], 0).T
+
+    system = ScreenMask(mask(), "geometric", points=5, tolerance=2e-3).system(camera, PLANE, ORDERS)
+    level = float(wg.ghost_images(camera, jnp.zeros((1, 2)), OBJECT, ORDERS).weight.sum())
+    assert relative_l2(level * system(jnp.asarray(image)), traced(camera, scene)) < 0.03
+    alone = ScreenMask(mask(), "geometric", points=5).system(camera, PLANE, ORDERS, "no_ghosts")
+    assert relative_l2(alone(jnp.asarray(image)), system(jnp.asarray(image))) > 0.1
+
+
+def test_a_study_with_a_mask_refuses_the_mistakes_of_a_lens():
+    given = {"mask": ScreenMask(tc.Pinhole(0.2)), "band_samples": None}
+    with pytest.raises(FieldError, match="'no_smear' is of a camera with a lens; choose none or"):
+        tiny_screen.study(models=(ScreenModel("sharp", "no_smear"),), **given)
+    with pytest.raises(FieldError, match="the smear of the band is left out behind a mask"):
+        tiny_screen.study(mask=given["mask"])
+    with pytest.raises(FieldError, match="a mask takes a hologram of one colour"):
+        tiny_screen.study(tiny_screen.camera(), tiny_screen.camera(), **given)
