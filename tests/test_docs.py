@@ -335,28 +335,31 @@ FITS = {
     "plan": "rig_scene",
     "camera": "rig_scene",
     "methods": "fza_harmonics",
+    "models": "stis",
+    "guide/stis.md: mask": "stis",
 }
 
 
 def sections():
-    """Page, key and value of each section in YAML; a list is one of methods."""
+    """File, key and value of each section in YAML; a list is one of methods."""
     for page, text in blocks("yaml"):
         # A block shows several sections of a key below each other.
         for part in re.split(r"^(?=\w)", text, flags=re.MULTILINE):
             found = yaml.safe_load(part)
             found = {"methods": found} if isinstance(found, list) else found or {}
             for key, value in found.items():
-                yield pytest.param(key, value, id=f"{page}: {key}")
+                name = f"{page}: {key}"
+                yield pytest.param(FITS.get(name) or FITS[key], key, value, id=name)
 
 
-@pytest.mark.parametrize(("key", "value"), list(sections()))
-def test_a_section_of_a_page_fits_into_an_experiment(key, value):
+@pytest.mark.parametrize(("file", "key", "value"), list(sections()))
+def test_a_section_of_a_page_fits_into_an_experiment(file, key, value):
     """In place of the file's own; a plan changes the entries that it names."""
     entries = (
         {f"plan.{name}": one for name, one in value.items()} if key == "plan" else {key: value}
     )
     overrides = tuple(f"{path}={json.dumps(one)}" for path, one in entries.items())
-    config = load_experiment(ROOT / f"configs/{FITS[key]}.yaml", overrides, None)
+    config = load_experiment(ROOT / f"configs/{file}.yaml", overrides, None)
     assert getattr(config, key)
 
 

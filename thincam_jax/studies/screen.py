@@ -313,16 +313,6 @@ class ScreenResult:
         headings = ("model", *(f"{name}, mean dB" for name in self.study.solvers))
         return Table(headings, rows, (1,) * len(self.study.solvers))
 
-    def metrics(self, rays: "RaySummary") -> dict[str, Any]:
-        """Ranges of the rays, scores of every model by every solver, and the system's entries."""
-        system, models = self.study.systems[0], {}
-        for name, model in self.models.items():
-            methods = {solver: asdict(one.scores) for solver, one in model.methods.items()}
-            models[name] = {"mistake": model.mistake, "methods": methods}
-        size = (system.matrix if isinstance(system, MaskSystem) else system.values).size
-        known = {name: value for name, value in asdict(rays).items() if value is not None}
-        return {"rays": known, "models": models, "entries_of_the_system": int(size)}
-
     @property
     def right(self) -> ModelResult:
         """The model that takes the captures."""
@@ -353,6 +343,17 @@ class ScreenResult:
         from thincam_jax.plot.screen import draw_images
 
         return draw_images(self, new_figure(1.0, 1.0))
+
+
+def screen_metrics(result: ScreenResult, rays: "RaySummary") -> dict[str, Any]:
+    """Ranges of the rays, scores of every model by every solver, and the system's entries."""
+    system, models = result.study.systems[0], {}
+    for name, model in result.models.items():
+        methods = {solver: asdict(one.scores) for solver, one in model.methods.items()}
+        models[name] = {"mistake": model.mistake, "methods": methods}
+    size = (system.matrix if isinstance(system, MaskSystem) else system.values).size
+    known = {name: value for name, value in asdict(rays).items() if value is not None}
+    return {"rays": known, "models": models, "entries_of_the_system": int(size)}
 
 
 class ScreenRun:

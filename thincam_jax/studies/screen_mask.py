@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity
 from thincam_jax.imaging.operators import Matrix, kernel_grid, low_rank_psf
@@ -46,8 +47,8 @@ class MaskSystem(Matrix):
 
     errors: tuple[float, float] = eqx.field(static=True)
 
-    def __init__(self, matrix, in_shape, out_shape, errors: tuple[float, float]):
-        super().__init__(matrix, in_shape, out_shape)
+    def __init__(self, matrix: Numbers, shapes: tuple[Shape, Shape], errors: tuple[float, float]):
+        super().__init__(matrix, *shapes)
         self.errors = errors
 
     def __str__(self) -> str:
@@ -112,7 +113,7 @@ class ScreenMask:
         cells = jnp.asarray(first.T.toarray(), psfs.dtype).reshape(-1, *field)
         seen = jax.lax.map(fit.operator, cells, batch_size=_TOGETHER).reshape(len(cells), -1)
         errors = fit.truncation_error, fit.interpolation_error
-        return MaskSystem(seen.T, plane.shape, sensor.shape, errors)
+        return MaskSystem(seen.T, (plane.shape, sensor.shape), errors)
 
 
 def require_mask_fits(

@@ -28,6 +28,7 @@ from thincam_jax.studies.screen import (
     ScreenResult,
     ScreenRun,
     ScreenStudy,
+    screen_metrics,
     summarise_rays,
 )
 from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun, CalibrationScores
@@ -70,10 +71,10 @@ def build_screen(config: ScreenConfig) -> ScreenStudy:
 
 def build_mask(config: ScreenConfig) -> ScreenMask | None:
     """The mask in the lens' place, if there is one."""
-    if (asked := config.mask) is None:
+    if (mask := config.mask) is None:
         return None
-    numbers = asked.beta or 0.0, 0.0, asked.distance, config.hologram.recorded[0], asked.width
-    return asked.build(mask=build_optics(asked, config.sensor, Exposure(*numbers))[0])
+    numbers = mask.beta or 0.0, 0.0, mask.distance, config.hologram.recorded[0], mask.width
+    return mask.build(mask=build_optics(mask, config.sensor, Exposure(*numbers))[0])
 
 
 def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
@@ -126,7 +127,7 @@ class _ScreenRun(Run):
         summary = summarise_rays(study, rays)
         memory = round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2)
         kind = {"study": study.name, "kind": self.config.kind, "seed": study.seed}
-        self.metrics = kind | result.metrics(summary) | {"peak_memory_gb": memory}
+        self.metrics = kind | screen_metrics(result, summary) | {"peak_memory_gb": memory}
         drawn = plot.draw_result(result, rays)
         if calibrated is not None:
             self.metrics["calibration"] = asdict(calibrated.scores)
@@ -136,8 +137,7 @@ class _ScreenRun(Run):
         for name, one in found[study.models[0].name].methods.items():
             for target, image in zip(study.targets, one.images, strict=True):
                 self.folder.save_image(f"{slug(target)}--{slug(name)}", np.asarray(image))
-        scores = None if calibrated is None else calibrated.scores
-        self.complete(page(self.config, result, summary, scores, memory))
+        self.complete(page(result, summary, calibrated and calibrated.scores, memory))
 
 
 def published_figures(targets: Sequence[ScreenTargetConfig]) -> dict[str, dict[str, Any]]:
@@ -149,13 +149,10 @@ def published_figures(targets: Sequence[ScreenTargetConfig]) -> dict[str, dict[s
 
 
 def page(
-    config: ScreenConfig,
-    result: ScreenResult,
-    rays: RaySummary,
-    calibration: CalibrationScores | None,
-    peak: float,
+    result: ScreenResult, rays: RaySummary, calibration: CalibrationScores | None, peak: float
 ) -> Page:
     """The page of a finished run; `peak`: the most memory it took, GB."""
+    config: ScreenConfig = result.study.config
     last = config.methods[-1].name
     published = published_figures(config.targets)
     mask, captions = config.mask, plot.captions(result.study)
@@ -181,10 +178,10 @@ def page(
     calibrated = ()
     if calibration is not None and config.calibration is not None:
         calibrated = _calibration(config, config.calibration, calibration)
-    titles = "Beside the thesis' Table 5.1", PUBLISHED
-    beside, note = titles if any(published.values()) else ("Pictures", "")
+    known = any(published.values())
+    title, note = ("Beside the thesis' Table 5.1", PUBLISHED) if known else ("Pictures", "")
     parts = (
-        Part(beside, (result.published_table(published), note)),
+        Part(title, (result.published_table(published), note)),
         Part("What an error of the model costs", errors, "Errors of the model"),
         Part("Calibration with Hadamard patterns", calibrated, "Calibration"),
         Part("Notes", config.notes),
