@@ -7,7 +7,7 @@ agree within the noise, the rig's geometry, electronics and bookkeeping are righ
 import math
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from thincam_jax import waveguide as wg
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import ReducedMatrix, Sparse
+from thincam_jax.imaging.operators import CropConvolution, LowRank, ReducedMatrix, Sparse
+from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.lensless.forward import imaging_operator
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.measured import calibration
 from thincam_jax.reconstruction import (
     AbstractSolver,
@@ -383,6 +386,48 @@ def reconstruct_pictures(
     seen = ScreenCaptures(reduced.project(matrix, captures), noise)
     found = {n: reconstructed(targets, solver, reduced, seen) for n, solver in solvers.items()}
     return ShownPictures(dict(targets), captures, found)
+
+
+def lensless_system(study: Study, width: float) -> CropConvolution | LowRank:
+    """From a monitor that covers so many mm to the sensor, by a study's first camera."""
+    shape = same_parity(_field_shape(study, width), study.sensor.shape)
+    exposure = study.methods[0].exposures[0]
+    light, method = exposure.wavelength, PsfMethod(study.model, pixel_integration=True)
+    camera, distance = study.camera(exposure), study.object_distance
+    return imaging_operator(camera, light, distance, field_shape=shape, model=method)
+
+
+def align_display(
+    study: Study,
+    frames: Float[np.ndarray, "frame y x"],
+    shown: Sequence[np.ndarray],
+    pitch: float,
+    kind: calibration.MapKind,
+) -> calibration.Alignment:
+    """Find a display before a study's first camera, by frames of a mark each.
+
+    - `study`: its `config` has the object's width, within which marks are looked for.
+    - `shown`: levels of the display for each frame. `pitch`: of its pixels, mm.
+
+    **Errors**: MeasurementError where too few marks agree; see `fit_alignment`.
+    """
+    exposure = study.methods[0].exposures[0]
+    field = same_parity(_field_shape(study, study.config.object.width), (0, 0))
+    wide = Sensor(tuple(np.add(study.sensor.shape, field).tolist()), study.pitch)
+    psf = np.asarray(replace(study, sensor=wide).psf(exposure), float)
+    pixel = -study.pitch * study.object_distance / exposure.distance  # turned by 180°
+    middle = (np.array(shown[0].shape) - 1) / 2
+    places = [np.argwhere(levels).mean(axis=0) for levels in shown]
+    marks, number = np.unique(places, axis=0, return_inverse=True)
+    radius = pitch * math.sqrt(np.count_nonzero(shown[0]) / math.pi) / abs(pixel)
+    seen = []
+    for mark in range(len(marks)):
+        mean = frames[number == mark].mean(axis=0, dtype=float)
+        found = calibration.locate_mark(mean, psf, radius)
+        seen.append(found and (pixel * found[0], pixel**2 * found[1]))
+    on_display = pitch * (marks - middle)[:, ::-1]
+    display = (shown[0].shape[0], shown[0].shape[1]), pitch
+    return calibration.fit_alignment(display, on_display, seen, kind, abs(pixel))
 
 
 class _KnownRows:

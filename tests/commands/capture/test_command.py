@@ -268,7 +268,13 @@ def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, t
 
 @pytest.mark.parametrize(
     ("name", "steps"),
-    [("rig_virtual", 5), ("rig_hadamard", 1032), ("rig_pictures", 8), ("rig_scene", 24)],
+    [
+        ("rig_virtual", 5),
+        ("rig_hadamard", 1032),
+        ("rig_pictures", 8),
+        ("rig_scene", 24),
+        ("rig_alignment", 14),
+    ],
 )
 def test_shipped_files(name, steps):
     config = load_as(CaptureConfig, ROOT / "configs" / f"{name}.yaml")

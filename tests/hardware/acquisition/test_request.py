@@ -22,6 +22,11 @@ ZONES = {"betas": (25.0,), "width": 1.4}
         (PlanRequest("pictures", cells=(2, 3), frames=3, dark_frames=1), 7, {None}),
         (PlanRequest("scene", frames=3, dark_frames=1), 4, {None}),
         (PlanRequest("grey_levels", frames=2), 36, {None}),
+        (
+            PlanRequest("alignment", **ZONES, marks=(3, 4), spread=60.0, size=4.0, frames=2),
+            24,
+            {None},
+        ),
         (PlanRequest("scene", exposures=(0.1, 1.0), frames=3, dark_frames=2), 10, {None}),
     ],
     ids=lambda given: getattr(given, "kind", ""),

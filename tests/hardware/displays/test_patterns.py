@@ -116,3 +116,16 @@ def test_a_picture_is_the_one_of_the_plan():
     for other in ({}, {"own": picture ^ 1}, {"own": picture.reshape(8, 4)}):
         with pytest.raises(ValueError, match="the picture 'own' is not the one of the plan"):
             pattern_levels(shown, SHAPE, PITCH, other)
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (41, 61)])
+def test_a_mark_is_a_disc_about_the_pixel_nearest_to_its_place(shape):
+    """Its mean place is exact, whatever a display makes of levels between black and white."""
+    mark = Pattern("mark", {"x": 4.2, "y": -3.1, "size": 3.0})
+    levels = pattern_levels(mark, shape, 0.5)
+    assert set(np.unique(levels)) == {0, 255}
+    row, column = np.argwhere(levels).mean(axis=0)
+    assert row == round((shape[0] - 1) / 2 - 6.2) and column == round((shape[1] - 1) / 2 + 8.4)
+    assert abs(np.count_nonzero(levels) / (np.pi * 9) - 1) < 0.2
+    with pytest.raises(ValueError, match="a mark of 3 mm at 14.5, 0 mm is not all on the display"):
+        pattern_levels(Pattern("mark", {"x": 14.5, "y": 0.0, "size": 3.0}), shape, 0.5)

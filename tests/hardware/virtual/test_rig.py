@@ -13,7 +13,13 @@ from thincam_jax.hardware.errors import NotFound
 from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 from thincam_jax.hardware.virtual.faults import Faults
-from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, cells_shown
+from thincam_jax.hardware.virtual.optics import (
+    ModulatorOptics,
+    MonitorOptics,
+    MonitorPose,
+    cells_seen,
+    cells_shown,
+)
 from thincam_jax.hardware.virtual.rig import Electronics, Fiducial, VirtualRig, pattern_number
 from thincam_jax.imaging.operators import Matrix, Sparse
 from thincam_jax.imaging.targets import usaf1951
@@ -163,3 +169,28 @@ def test_a_virtual_device_names_the_extra_that_is_missing(monkeypatch):
     for connect, driver in ((devices.camera, "usb3_vision"), (devices.stage, "zaber")):
         with pytest.raises(NotFound, match=r"pip install 'thincam-jax\[hardware\]'"):
             connect(driver)
+
+
+def test_a_monitor_is_seen_where_its_pixels_are_in_space():
+    """As a pinhole casts three of them on a plane at 250 mm; turned by 180° on the sensor."""
+    pose = MonitorPose(x=3.0, y=-2.0, z=5.0, rotation=0.1, turn=0.2, tilt=-0.3)
+    across = np.array([math.cos(0.2), 0.0, math.sin(0.2)])  # its x axis, without rotation
+    down = np.array(
+        [-math.sin(0.2) * math.sin(-0.3), math.cos(-0.3), math.cos(0.2) * math.sin(-0.3)]
+    )
+    for x, y in ((0.0, 0.0), (40.0, -30.0), (-25.0, 10.0)):
+        u = x * math.cos(0.1) - y * math.sin(0.1)
+        v = x * math.sin(0.1) + y * math.cos(0.1)
+        point = np.array([3.0, -2.0, 255.0]) + u * across + v * down
+        found = pose.homography(250.0, 0.5, -2.0) @ [x / 0.5, y / 0.5, 1.0]
+        assert np.allclose(found[:2] / found[2], -point[:2] / point[2] * 250.0 / 2.0)
+
+
+def test_cells_of_a_monitor_that_stands_right_are_those_shown():
+    """Two pixels a cell; then a cell further to the right."""
+    shown = np.kron(np.arange(32).reshape(4, 8), np.full((2, 2), 8)).astype(np.uint8)
+    inner, place = (slice(1, -1), slice(1, -1)), np.diag([0.5, 0.5, 1.0])
+    found = cells_seen(shown, (4, 8), place)
+    assert np.abs(found - cells_shown(shown, (4, 8)))[inner].max() < 1e-6
+    moved = cells_seen(shown, (4, 8), np.array([[0.5, 0, 1], [0, 0.5, 0], [0, 0, 1]]))
+    assert np.allclose(moved[1:-1, 2:-1], found[1:-1, 1:-2])

@@ -212,7 +212,7 @@ def _shown(render: Callable[["Pattern"], Any], pattern: "Pattern") -> Any:
     try:
         return render(pattern)
     except ValueError as error:
-        key = "width" if pattern.kind == "fza" else "cells"
+        key = {"fza": "width", "mark": "spread"}.get(pattern.kind, "cells")
         raise ConfigError(f"plan.{key}: {error}") from None
 
 
@@ -223,12 +223,18 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
     from thincam_jax.imaging.scene import Scene
     from thincam_jax.imaging.sensor import Sensor
+    from thincam_jax.studies.rig import lensless_system
 
     virtual, display, optics = config.virtual, config.display, config.optics
     assert virtual is not None  # checked with the file
     if optics is None:
         before = picture_levels(config).popitem()[1] if config.plan.kind == "scene" else None
         seen = MonitorOptics(screen_system(config), virtual.electrons, before)
+    elif config.plan.kind in ("pictures", "alignment"):
+        cell = -config.camera.pitch * optics.object.distance / optics.distance  # turned by 180°
+        place = virtual.monitor.build().homography(optics.object.distance, display.pitch, cell)
+        system = lensless_system(build_study(config, virtual.sensor), optics.object.width)
+        seen = MonitorOptics(system, virtual.electrons, place=place)
     else:
         plane = build_study(config, virtual.sensor).targets[0].plane
         scene, sensor = Scene(plane, optics.wavelength), Sensor(virtual.sensor, config.camera.pitch)
@@ -260,7 +266,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     }
     if kind in series:
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
-    elif kind == "scene":
+    elif kind == "scene" or config.alignment:
         frames, variance = found.scene()
     else:
         frames = found.captures()
@@ -273,7 +279,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         electron, offset = virtual.build(Electronics).scale(found.settings[0])
         counts = electron * found.settings[0].exposure * virtual.electrons
         camera = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
-    display = (768, 1024) if virtual is None else virtual.display
+    display = found.provenance.get("display_shape") or (virtual and virtual.display) or (768, 1024)
     given = {"shape": display, "pitch": config.display.pitch, "pictures": picture_levels(config)}
     render = partial(pattern_levels, **given)
     seconds = store / _SECONDS

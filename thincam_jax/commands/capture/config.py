@@ -1,5 +1,6 @@
 """Experiment files of `kind: capture`: the devices of a rig, the plan, and what is seen."""
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -20,9 +21,10 @@ from thincam_jax.commands.sections import (
     VariationConfig,
     check_names,
 )
-from thincam_jax.hardware.acquisition.request import ANYTHING, MONITOR, PlanRequest
+from thincam_jax.hardware.acquisition.request import MONITOR, PlanRequest
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.virtual.optics import MonitorPose
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -79,6 +81,10 @@ class ReconstructionConfig(Section):
     variation: VariationConfig | None = None
 
 
+class MonitorConfig(section(MonitorPose)):
+    """Pose of a monitor beside the middle of the object's plane."""
+
+
 _RIG = ("full_well", "read_noise", "offset", "response", "fiducial")
 
 
@@ -89,12 +95,14 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
     - `electrons`: per second, of a pixel from each mm² of open aperture before a white scene; with
       a screen, of the brightest pixel before a white monitor.
     - `screen`: a see-through camera before a monitor, for a Hadamard plan.
+    - `monitor`: where it really stands, before a lensless camera.
     """
 
     sensor: tuple[Count, Count]
     display: tuple[Count, Count]
     electrons: Annotated[float, Field(gt=0)]
     screen: SeeThroughConfig | None = None
+    monitor: MonitorConfig = MonitorConfig()
 
 
 class CaptureConfig(ExperimentConfig):
@@ -105,6 +113,7 @@ class CaptureConfig(ExperimentConfig):
       one; or the pictures of a plan of kind pictures, on its cells.
     - `matrix`: with which such pictures, or a scene, are reconstructed: matrix.zarr of a
       calibration's run, or the store of its captures; by `methods`.
+    - `alignment`: alignment.json of such a plan: shows pictures where a lensless model has them.
     """
 
     kind: Literal["capture"]
@@ -119,46 +128,41 @@ class CaptureConfig(ExperimentConfig):
     virtual: VirtualConfig | None = None
     targets: tuple[ScreenTargetConfig, ...] = ()
     matrix: str | None = None
+    alignment: str | None = None
     methods: tuple[ScreenMethodConfig, ...] = ()
     notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
-        kind, by_cells, optics = self.plan.kind, self.by_cells, self.optics is not None
-        if kind in ("method_a", "psf_stack") and self.stage is None:
-            raise FieldError(f"a plan of kind {kind} moves a stage; give one", "stage")
-        simulated = self.rig == "virtual"
-        if self.display.pitch is None and (kind != "scene" or simulated):
-            raise FieldError(
-                f"a plan of kind {kind} is shown on pixels; give it", "display", "pitch"
-            )
-        if optics and self.plan.width is None and not by_cells:
-            raise FieldError("optics need betas and width of the mask; give them", "plan", "width")
-        if by_cells == optics and (by_cells or simulated or kind not in ANYTHING):
-            verb = "takes no" if by_cells else "needs"
-            raise FieldError(f"a plan of kind {kind} {verb} optics", "optics")
-        if kind == "grey_levels" and self.display.options.get("grey_levels"):
-            raise FieldError("this plan measures it; drop it", "display", "options", "grey_levels")
         check_names(self, "methods", "targets")
-        if (kind == "pictures") != (self.matrix is not None) and kind != "scene":
-            verb = "needs it" if kind == "pictures" else "takes none; drop it"
-            raise FieldError(f"a plan of kind {kind} {verb}", "matrix")
-        if self.matrix is not None:
-            for key in ("targets", "methods") if kind == "pictures" else ("methods",):
-                if not getattr(self, key):
-                    raise FieldError(f"a plan of kind {kind} needs them; give one", key)
-        elif self.methods:
-            raise FieldError(f"a plan of kind {kind} has 'reconstruction'; drop them", "methods")
-        if kind != "pictures" and len(self.targets) > 1:
-            raise FieldError(f"a plan of kind {kind} has one; drop the others", "targets")
-        if simulated:
-            self._check_virtual()
+        for broken, message, *place in self._rules():
+            if broken:
+                raise FieldError(message, *place)
         return self
 
-    @property
-    def by_cells(self) -> bool:
-        """Whether the camera is one of cells, with a matrix."""
-        return self.plan.kind in MONITOR or self.matrix is not None
+    def _rules(self) -> Iterator[tuple[Any, ...]]:
+        """Whether each rule is broken, what is wrong then, and where; the first one counts."""
+        kind, simulated, virtual = self.plan.kind, self.rig == "virtual", self.virtual
+        plan, given = self.plan.build(), {name for name, value in self if value}
+        yield from plan.rules(given, self.display.pitch, len(self.targets), simulated)
+        corrected = kind == "grey_levels" and self.display.options.get("grey_levels")
+        yield corrected, "this plan measures it; drop it", "display", "options", "grey_levels"
+        yield simulated and virtual is None, "rig: virtual needs this section", "virtual"
+        if simulated and virtual is not None:
+            unseen = kind not in MONITOR and not self.targets
+            yield unseen, "a virtual rig looks at one; give it", "targets"
+            if plan.by_cells("matrix" in given, "optics" in given):
+                screen, place = virtual.screen, ("virtual", "screen")
+                yield screen is None, f"a virtual rig for a plan of kind {kind} needs it", *place
+                assert screen is not None
+                coloured = screen.hologram.colours is not None
+                fault = f"a plan of kind {kind} takes one colour; give wavelength instead"
+                yield coloured, fault, *place, "hologram", "colours"
+                fault = f"the plan shows {self.plan.cells}; give these"
+                other = self.plan.cells not in (None, screen.object.cells)
+                yield other, fault, *place, "object", "cells"
+                fault = f"virtual.sensor is {virtual.sensor}; give this"
+                yield screen.sensor.shape != virtual.sensor, fault, *place, "sensor", "shape"
 
     @property
     def cells(self) -> tuple[int, int] | None:
@@ -171,23 +175,3 @@ class CaptureConfig(ExperimentConfig):
         """Driver and options of each device, by its role."""
         devices = {"camera": self.camera, "display": self.display, "stage": self.stage}
         return {role: (one.driver, one.options) for role, one in devices.items() if one is not None}
-
-    def _check_virtual(self) -> None:
-        plan, virtual = self.plan, self.virtual
-        if virtual is None:
-            raise FieldError("rig: virtual needs this section", "virtual")
-        if plan.kind not in MONITOR and not self.targets:
-            raise FieldError("a virtual rig looks at one; give it", "targets")
-        if not self.by_cells:
-            return
-        seen, place = virtual.screen, ("virtual", "screen")
-        if seen is None:
-            raise FieldError(f"a virtual rig for a plan of kind {plan.kind} needs it", *place)
-        if seen.hologram.colours is not None:
-            message = f"a plan of kind {plan.kind} takes one colour; give wavelength instead"
-            raise FieldError(message, *place, "hologram", "colours")
-        if plan.cells not in (None, seen.object.cells):
-            raise FieldError(f"the plan shows {plan.cells}; give these", *place, "object", "cells")
-        if seen.sensor.shape != virtual.sensor:
-            message = f"virtual.sensor is {virtual.sensor}; give this"
-            raise FieldError(message, *place, "sensor", "shape")

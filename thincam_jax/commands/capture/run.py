@@ -1,6 +1,5 @@
 """Reconstruction of a store of captures: an image or a system matrix, and a report."""
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import write_image
+from thincam_jax.measured.calibration import Alignment
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
 from thincam_jax.studies.pictures import PUBLISHED, beside, finding
@@ -28,6 +28,7 @@ from thincam_jax.studies.rig import (
     FrameAgreement,
     MatrixAgreement,
     RigFrames,
+    align_display,
     calibrated,
     compare_frames,
     frame_solver,
@@ -87,10 +88,10 @@ class _CaptureRun(Run):
             "seconds": {name: round(s, 4) for name, s in taken.seconds.items()},
         }
         self.add("captures", self.show)
-        if config.plan.kind == "hadamard":
-            self.add("system matrix", self.recover)
-        elif config.plan.kind == "grey_levels":
-            self.add("grey levels", self.linearise)
+        kind, table, place = config.plan.kind, self.linearise, self.align
+        steps = {"hadamard": self.recover, "grey_levels": table, "alignment": place}
+        if kind in steps:
+            self.add("system matrix" if kind == "hadamard" else kind.replace("_", " "), steps[kind])
         elif config.matrix is not None:
             self.add("images", self.look)
         elif config.plan.kind != "psf_stack" and config.optics is not None:
@@ -155,6 +156,15 @@ class _CaptureRun(Run):
             self.found = finding(found.methods)
             self.table = beside(found.methods, published_figures(config.targets))
 
+    def align(self) -> None:
+        """The place of the display, which `alignment` of a plan of pictures takes."""
+        frames, config = self.taken.seen.frames, self.config
+        study = build_study(config, (frames.shape[1], frames.shape[2]))
+        display = self.taken.shown, config.display.pitch or 0.0
+        found = align_display(study, frames, *display, config.plan.map)
+        found.write(self.folder.path / "alignment.json")
+        self.metrics["alignment"], self.found = found.summary(), str(found)
+
     def linearise(self) -> None:
         """The table of a display's grey levels, which its option of that name takes."""
         self.taken.calibration.write(self.folder.path / "grey_levels.json")
@@ -184,18 +194,14 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     """
     plan, optics, display = config.plan, config.optics, config.display
     assert optics is not None and plan.width is not None  # of lensless plans
-    synthesis: Synthesis = "phase_pairs" if plan.kind == "method_b" else "fringe_scanning"
-    if plan.kind in ("psf_stack", "scene"):
-        synthesis = "separate"
+    monitor = plan.kind in ("pictures", "alignment")  # the display is no mask
+    other: Synthesis = "fringe_scanning" if plan.kind in ("fringe_scan", "method_a") else "separate"
+    synthesis: Synthesis = "phase_pairs" if plan.kind == "method_b" else other
     phases = PHASES.get(synthesis, (plan.phase,))
     distances = plan.distances if plan.kind == "method_a" else (optics.distance,)
-    settings = list(itertools.product(distances, plan.betas))
-    exposures = Exposures(
-        [beta for _, beta in settings],
-        [distance for distance, _ in settings],
-        wavelength=optics.wavelength,
-        width=plan.width,
-    ).at_phases(phases)
+    betas, distances = np.broadcast_arrays(plan.betas, distances)  # one of either
+    light = {"wavelength": optics.wavelength, "width": plan.width}
+    exposures = Exposures(betas, distances, **light).at_phases(phases)
     solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
 
     def grey(entry: PictureConfig) -> Target:
@@ -206,7 +212,8 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
         return replace(target, plane=ImagePlane(image, target.distance, target.width))
 
     pixels = {"pixel_pitch": display.pitch, "fill_factor": display.fill_factor}
-    mask = MaskConfig.model_construct(width=plan.width, profile=plan.profile, **pixels)
+    given = {"width": plan.width, "profile": plan.profile} | ({} if monitor else pixels)
+    mask = MaskConfig.model_construct(**given)
     sensor = SensorConfig.model_construct(shape=shape, pitch=config.camera.pitch)
     return Study(
         *build_optics(mask, sensor, exposures[0]),
@@ -224,11 +231,14 @@ def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
 
     **Errors**: ConfigError for pictures that cannot be read.
     """
-    if config.matrix is None or config.cells is None:
+    if config.cells is None or not (config.matrix or config.alignment):
         return {}
 
     def levels(one: PictureConfig) -> tuple[str, np.ndarray]:
-        return one.name, np.rint(255 * picture(one, config.cells)).astype(np.uint8)
+        found = np.rint(255 * picture(one, config.cells)).astype(np.uint8)
+        if config.alignment and config.optics:
+            found = Alignment.read(config.alignment).place(found, config.optics.object.width)
+        return one.name, found
 
     return dict(config.read_all("targets", levels, "path"))
 

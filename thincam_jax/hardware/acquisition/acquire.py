@@ -137,6 +137,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     first = run.steps[0]
     frame, facts = run.take(first, settings[first.settings], probe=True)
     run.bits = bits = frame.bit_depth
+    by_hand = isinstance(run.rig.display, Shutter)
     attributes = {
         "kind": CAPTURES,
         "sensor_shape": shape,
@@ -149,6 +150,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             "asked": [asdict(one) for one in run.plan.settings],
             "procedure": asdict(run.procedure),
             "start": facts["position"],
+            "display_shape": () if by_hand else run.rig.display.shape,
             "versions": versions(),
             "begun": now(),
         },

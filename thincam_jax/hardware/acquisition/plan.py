@@ -4,7 +4,8 @@ A plan holds a table of patterns, one of camera settings, and the steps, which p
 SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with its own plan. The
 ready-made plans are those of the thesis: fringe scanning, method A (several mask-sensor distances),
 method B (pairs of phases of several β), a stack of PSFs by depth, Hadamard calibration, and
-pictures on the calibrated cells; and scenes, at one exposure or more, and levels of a display.
+pictures on the calibrated cells; and scenes, at one exposure or more, levels of a display, and
+marks that tell where it is.
 """
 
 import dataclasses
@@ -39,6 +40,7 @@ class Pattern:
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
     - "picture": `name` and SHA-256 `digest` of its levels on `rows` × `columns` cells.
+    - "mark": a white disc of the diameter `size` at `x`, `y` from the display's middle, mm.
     - "uniform": `level` of all pixels. "black": no numbers. Other kinds are the renderer's own.
     """
 
@@ -290,6 +292,25 @@ def grey_levels(settings: CameraSettings, *, frames: int = 1) -> Plan:
     """Every fifteenth level of a display, the brightest first; `measured_levels` takes them."""
     levels = [Pattern("uniform", {"level": level}) for level in range(255, -1, -15)]
     return _plan("grey_levels", [(one, None) for one in levels for _ in range(frames)], settings, 0)
+
+
+def alignment(
+    marks: tuple[int, int],
+    spread: float,
+    size: float,
+    settings: CameraSettings,
+    *,
+    frames: int = 1,
+    dark_frames: int = 0,
+) -> Plan:
+    """Marks, one at a time, in rows and columns on a square of the side `spread`, mm.
+
+    - `size`: diameter of a mark, mm. `frames`: of each.
+    """
+    rows, columns = (np.linspace(-spread / 2, spread / 2, count).tolist() for count in marks)
+    every = [Pattern("mark", {"x": x, "y": y, "size": size}) for y in rows for x in columns]
+    shots = [(one, None) for one in every for _ in range(frames)]
+    return _plan("alignment", shots, settings, dark_frames)
 
 
 def scene(

@@ -1,8 +1,8 @@
 """A plan of captures given by its numbers, checked before any device is opened."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from thincam_jax._core.quantity import FieldError, check_fields, choice, quantit
 from thincam_jax.hardware.acquisition import plan as plans
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.lensless.masks.fza import PROFILES, Profile
+from thincam_jax.measured.calibration.alignment import MapKind
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, HadamardSeries, Order
 
 PlanKind = Literal[
@@ -21,8 +22,9 @@ PlanKind = Literal[
     "pictures",
     "scene",
     "grey_levels",
+    "alignment",
 ]
-MONITOR = "hadamard", "pictures"  # plans of a monitor's cells
+MONITOR = "hadamard", "pictures", "alignment"  # plans of a monitor
 ANYTHING = "scene", "grey_levels"  # plans before which anything may stand
 # What each kind needs, and what it may have beside the dark frames.
 _ZONES = ("betas", "width")
@@ -32,12 +34,14 @@ _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "method_b": (_ZONES, ("profile",)),
     "psf_stack": ((*_ZONES, "distances"), ("profile", "phase")),
     "hadamard": (("cells",), ("order", "display")),
-    "pictures": (("cells",), ("frames",)),
+    "pictures": (("cells",), (*_ZONES, "profile", "phase", "frames")),
     "scene": ((), (*_ZONES, "profile", "phase", "frames", "exposures")),
     "grey_levels": ((), (*_ZONES, "frames")),
+    "alignment": ((*_ZONES, "marks", "spread", "size"), ("profile", "phase", "map", "frames")),
 }
 _MM = quantity("mm", positive=True, many=True)
 _CELLS = whole(1, 65536, optional=True, many=True)
+_SIZE = quantity("mm", positive=True, optional=True)
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,9 @@ class PlanRequest:
       what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
     - `cells`: rows and columns of cells on a monitor.
     - `order`, `display`: of the Hadamard patterns.
-    - `frames`: of each picture or level, whose mean counts; of each exposure of a scene.
+    - `marks`: rows and columns of marks on a square of the side `spread` about a monitor's middle,
+      each with the diameter `size`; `map`: what is fitted to them, a "homography" if it is tilted.
+    - `frames`: of each picture, mark or level, whose mean counts; of each exposure of a scene.
     - `exposures`: of a scene, in place of the camera's; several are merged to one linear image.
     - `dark_frames`: in all; they are spread over the plan. Of a scene, for each exposure.
 
@@ -59,13 +65,17 @@ class PlanRequest:
 
     kind: Annotated[PlanKind, choice(get_args(PlanKind))]
     betas: Annotated[tuple[float, ...], quantity("rad/mm^2", positive=True, many=True)] = ()
-    width: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
+    width: Annotated[float | None, _SIZE] = None
     profile: Annotated[Profile, choice(PROFILES)] = "cosine"
     phase: Annotated[float, quantity("rad")] = 0.0
     distances: Annotated[tuple[float, ...], _MM] = ()
     cells: Annotated[tuple[int, int] | None, _CELLS] = None
     order: Annotated[Order, choice(get_args(Order))] = "sequency"
     display: Annotated[Display, choice(get_args(Display))] = "complementary"
+    marks: Annotated[tuple[int, int] | None, whole(1, 100, optional=True, many=True)] = None
+    spread: Annotated[float | None, _SIZE] = None
+    size: Annotated[float | None, _SIZE] = None
+    map: Annotated[MapKind, choice(get_args(MapKind))] = "similarity"
     frames: Annotated[int, whole(1, 1000)] = 1
     exposures: Annotated[tuple[float, ...], quantity("s", positive=True, many=True)] = ()
     dark_frames: Annotated[int, DARK_FRAMES] = 0
@@ -83,8 +93,7 @@ class PlanRequest:
             raise FieldError(f"a plan of kind {self.kind} takes {', '.join(allowed)}; drop it", key)
         if self.kind == "method_b" and len(self.betas) < 2:
             raise FieldError("method_b compares two β or more; give another", "betas")
-        several = self.kind == "method_b" or self.kind in MONITOR
-        if not several and len(self.betas) != 1 and (self.betas or self.kind not in ANYTHING):
+        if self.kind != "method_b" and len(self.betas) > 1:
             raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
         for key in ("frames", "dark_frames"):
             if len(self.exposures) > 1 and getattr(self, key) < 2:
@@ -97,6 +106,39 @@ class PlanRequest:
                 _ = self.series
             except ValueError as error:
                 raise FieldError(str(error), "cells") from None
+
+    def by_cells(self, matrix: bool, optics: bool) -> bool:
+        """Whether the camera is one of cells, with a matrix."""
+        return matrix or self.kind == "hadamard" or (self.kind == "pictures" and not optics)
+
+    def rules(
+        self, given: set[str], pitch: float | None, targets: int, simulated: bool
+    ) -> Iterator[tuple[Any, ...]]:
+        """Whether each rule of a file is broken, what is wrong then, and where.
+
+        - `given`: names of the sections that the file has. `pitch`: of its display.
+        """
+        name, kind = self.kind, f"a plan of kind {self.kind}"
+        optics, matrix, aligned = (key in given for key in ("optics", "matrix", "alignment"))
+        by_cells, pictures = self.by_cells(matrix, optics), name == "pictures"
+        moves = name in ("method_a", "psf_stack") and "stage" not in given
+        yield moves, f"{kind} moves a stage; give one", "stage"
+        unknown = pitch is None and (name != "scene" or simulated)
+        yield unknown, f"{kind} is shown on pixels; give it", "display", "pitch"
+        maskless = optics and self.width is None and not by_cells
+        yield maskless, "optics need betas and width of the mask; give them", "plan", "width"
+        unfit = by_cells == optics and (by_cells or simulated or name not in ANYTHING)
+        yield unfit, f"{kind} {'takes no' if by_cells else 'needs'} optics", "optics"
+        yield pictures and not (optics or matrix), f"{kind} needs it", "matrix"
+        yield matrix and not pictures and name != "scene", f"{kind} takes none; drop it", "matrix"
+        yield pictures and optics and not aligned, f"{kind} with optics needs it", "alignment"
+        yield aligned and not (pictures and optics), f"{kind} takes none; drop it", "alignment"
+        yield pictures and not targets, f"{kind} needs them; give one", "targets"
+        yield matrix and "methods" not in given, f"{kind} needs them; give one", "methods"
+        unused = "methods" in given and not matrix
+        yield unused, f"{kind} has 'reconstruction'; drop them", "methods"
+        several = targets > 1 and (aligned or not pictures)
+        yield several, f"{kind} has one; drop the others", "targets"
 
     @property
     def series(self) -> HadamardSeries:
@@ -117,6 +159,10 @@ class PlanRequest:
         - `shown`: levels of the pictures on the cells, uint8, by name.
         """
         dark = {"dark_frames": self.dark_frames}
+        if self.kind == "alignment":
+            assert self.marks and self.spread and self.size
+            grid = self.marks, self.spread, self.size
+            return plans.alignment(*grid, settings, frames=self.frames, **dark)
         if self.kind == "hadamard":
             return plans.hadamard(self.series, settings)
         if self.kind == "pictures":

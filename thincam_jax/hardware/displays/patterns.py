@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import skimage
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.hardware.acquisition.plan import Pattern, picture_digest
@@ -41,9 +42,21 @@ def pattern_levels(
     if pattern.kind == "hadamard":
         cells, frame = (numbers.pop("rows"), numbers.pop("columns")), numbers.pop("frame")
         return on_cells(255 * HadamardSeries(cells, **numbers).frame(frame), shape)
+    if pattern.kind == "mark":
+        return _mark(shape, pitch, **numbers)
     if pattern.kind != "fza":
         raise ValueError(f"a pattern of kind {pattern.kind!r} has no levels; give an own `render`")
     return mask_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
+
+
+def _mark(shape: tuple[int, int], pitch: float, x: float, y: float, size: float) -> np.ndarray:
+    """A white disc about the pixel nearest to (x, y)."""
+    levels, radius = np.zeros(shape, np.uint8), max(size / 2 / pitch, 0.6)
+    centre = [round((n - 1) / 2 + at / pitch) for n, at in zip(shape, (y, x), strict=True)]
+    if any(not radius <= at + 0.5 <= n - radius for n, at in zip(shape, centre, strict=True)):
+        raise ValueError(f"a mark of {size:g} mm at {x:g}, {y:g} mm is not all on the display")
+    levels[skimage.draw.disk(centre, radius)] = 255
+    return levels
 
 
 def mask_pattern(

@@ -2,16 +2,19 @@
 
 import functools
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import skimage
 from jaxtyping import Array, Complex, Float, UInt8
 from numpy.polynomial.legendre import leggauss
+from scipy.spatial.transform import Rotation
 
-from thincam_jax._core.grids import Grid, centred_indices
+from thincam_jax._core.grids import Grid, block_mean, centred_indices
 from thincam_jax._core.precision import as_complex, product
+from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse, kernel_grid
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.imaging.scene import Scene
@@ -23,9 +26,11 @@ from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.measured.calibration.alignment import to_indices
 
 _TERMS = 4  # singular terms of a pattern that are averaged exactly
 _POINTS = 4  # along a pixel, for the remainder
+_FINE = 4  # samples of a monitor along a cell
 
 
 @runtime_checkable
@@ -206,17 +211,19 @@ def _averaged(
 class MonitorOptics:
     """Cells on a monitor in front of a camera with a known operator.
 
-    The cells are the largest squares of monitor pixels that fit, centred; a cell's radiance is the
-    mean of its pixels' levels over 255.
+    The cells are the largest squares of monitor pixels that fit, centred, without a `place`; a
+    cell's radiance is the mean of its pixels' levels over 255.
 
     - `operator`: from the cells, 1 is white, to the sensor.
     - `electrons`: per second for each unit of the operator's output.
     - `transmission`: levels over 255 of what stands before the cells, which the monitor lights.
+    - `place`: homography from the monitor's pixels to cells, (x, y) from the middle of either.
     """
 
     operator: AbstractOperator
     electrons: float
     transmission: UInt8[np.ndarray, "y x"] | None = None
+    place: Float[np.ndarray, "3 3"] | None = None
 
     @functools.cached_property
     def _by_rows(self) -> Any:
@@ -232,7 +239,7 @@ class MonitorOptics:
         self, shown: UInt8[np.ndarray, "v u"], position: float
     ) -> Float[np.ndarray, "y x"]:
         rows, columns = self.operator.in_shape
-        cells = cells_shown(shown, (rows, columns)).astype(np.float32)
+        cells = cells_seen(shown, (rows, columns), self.place).astype(np.float32)
         if self.transmission is not None:
             cells *= self.transmission / np.float32(255)
         if self._by_rows is not None:
@@ -253,3 +260,48 @@ def cells_shown(
     part = shown[top : top + side * cells[0], left : left + side * cells[1]]
     blocks = part.reshape(cells[0], side, cells[1], side)
     return blocks.mean(axis=(1, 3), dtype=np.float64) / 255
+
+
+def cells_seen(
+    shown: UInt8[np.ndarray, "v u"], cells: tuple[int, int], place: Float[np.ndarray, "3 3"] | None
+) -> Float[np.ndarray, "y x"]:
+    """Mean level over 255 of each cell; see `MonitorOptics.place`."""
+    if place is None:
+        return cells_shown(shown, cells)
+    fine = _FINE * cells[0], _FINE * cells[1]
+    inverse = to_indices(shown.shape) @ np.linalg.inv(to_indices(fine, 1 / _FINE) @ place)
+    return block_mean(skimage.transform.warp(shown / 255, inverse, output_shape=fine), _FINE)
+
+
+@dataclass(frozen=True)
+class MonitorPose:
+    """Where a monitor stands, beside the middle of the object's plane.
+
+    - `x`, `y`, `z`: of its middle, mm; z is away from the camera.
+    - `rotation`: clockwise as seen; `turn`: its right side, `tilt`: its lower side is farther.
+    """
+
+    x: Annotated[float, quantity("mm")] = 0.0
+    y: Annotated[float, quantity("mm")] = 0.0
+    z: Annotated[float, quantity("mm")] = 0.0
+    rotation: Annotated[float, quantity("rad")] = 0.0
+    turn: Annotated[float, quantity("rad", least=-1.0, most=1.0)] = 0.0
+    tilt: Annotated[float, quantity("rad", least=-1.0, most=1.0)] = 0.0
+
+    def __post_init__(self):
+        check_fields(self)
+
+    def homography(
+        self, distance: float, pixel: float = 1.0, cell: float = 1.0
+    ) -> Float[np.ndarray, "3 3"]:
+        """From the monitor's pixels to cells on the plane at a distance, (x, y) from the middles.
+
+        - `pixel`, `cell`: their sides, mm; negative for an image that is turned by 180°.
+
+        That of a pinhole in the mask's middle: the PSF's own change with the depth is left out.
+        """
+        angles = self.rotation, self.tilt, -self.turn
+        turned = Rotation.from_euler("zxy", angles).as_matrix()
+        where = np.array([self.x, self.y, distance + self.z])
+        both = np.column_stack([turned[:, :2], where]) @ np.diag([pixel, pixel, 1])
+        return np.diag([1 / cell, 1 / cell, 1 / distance]) @ both

@@ -1,5 +1,9 @@
 """Calibration from captures: PSF fits, registration, stripes, Hadamard patterns, screens."""
 
+from thincam_jax.measured.calibration.alignment import Alignment as Alignment
+from thincam_jax.measured.calibration.alignment import MapKind as MapKind
+from thincam_jax.measured.calibration.alignment import fit_alignment as fit_alignment
+from thincam_jax.measured.calibration.alignment import locate_mark as locate_mark
 from thincam_jax.measured.calibration.captures import CaptureStoreError as CaptureStoreError
 from thincam_jax.measured.calibration.captures import CaptureWriter as CaptureWriter
 from thincam_jax.measured.calibration.captures import HadamardCaptures as HadamardCaptures

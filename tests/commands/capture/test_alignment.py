@@ -1,0 +1,94 @@
+"""Marks on a monitor before a lensless camera, by the commands, and pictures placed by them."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from commands.capture import tiny
+from commands.test_cli import call, one_line
+
+from thincam_jax.hardware.virtual.optics import MonitorPose
+from thincam_jax.measured.calibration import Alignment
+from thincam_jax.units import deg
+
+MASK = {"betas": ["60 rad/mm^2"], "width": "1.44 mm"}
+POSE = {"x": "2 mm", "y": "-1.5 mm", "z": "2 mm", "rotation": "3 deg", "turn": "6 deg"}
+ALIGNMENT = yaml.safe_load(tiny.METHOD_B) | {
+    "camera": {"driver": "usb3_vision", "exposure": "500 ms", "pitch": "22 um"},
+    "display": {"driver": "sdl", "pitch": "0.5 mm", "settle": "1 ms"},
+    "plan": {"kind": "alignment", "marks": [3, 3], "spread": "20 mm", "size": "3 mm"} | MASK,
+    "targets": [],
+}
+ALIGNMENT["plan"] |= {"map": "homography", "dark_frames": 1}
+ALIGNMENT["optics"] |= {"object": {"distance": "250 mm", "width": "40 mm"}}
+ALIGNMENT["virtual"] |= {"sensor": [96, 112], "monitor": POSE, "read_noise": 1.0}
+PICTURES = {"kind": "pictures", "cells": [16, 16]} | MASK
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("alignment"), yaml.safe_dump(ALIGNMENT))
+
+
+def pictures(alignment):
+    sets = f"plan={json.dumps(PICTURES)}", f"alignment={alignment}", "camera.exposure=20 ms"
+    target = "targets=[{name: coins, kind: photograph, image: coins}]"
+    return [part for one in (*sets, target) for part in ("--set", one)]
+
+
+@pytest.mark.thorough
+def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
+    """To a tenth of a pixel of the display; placed as if it stood right, they are worse."""
+    store, out = file.with_name("a.zarr"), file.with_name("out")
+    for args in (("capture", file, "--out", store), ("run", store, "--out", out)):
+        result = call(*args)
+        assert result.exit_code == 0, result.output
+    found = Alignment.read(out / "alignment.json")
+    assert found.used == 9
+    angles = {"rotation": 3 * deg, "turn": 6 * deg}
+    matrix = MonitorPose(x=2.0, y=-1.5, z=2.0, **angles).homography(250.0)
+    corners = np.array([[x, y, 1.0] for x in (-10.0, 10.0) for y in (-10.0, 10.0)])
+    true = corners @ matrix.T
+    missed = found(corners[:, :2]) - true[:, :2] / true[:, 2:]
+    assert np.abs(missed).max() < 0.1 * 0.5
+    assert "9 of 9 marks lie within" in (out / "report.html").read_text("utf-8")
+    wrong = json.loads((out / "alignment.json").read_text("utf-8"))
+    wrong |= {"unknowns": [1, 0, 0, 0, 1, 0, 0, 0]}
+    (out / "nominal.json").write_text(json.dumps(wrong), "utf-8")
+    scores = []
+    for name in ("alignment", "nominal"):
+        store, seen = file.with_name(f"{name}.zarr"), file.with_name(name)
+        result = call("capture", file, "--out", store, *pictures(out / f"{name}.json"))
+        assert result.exit_code == 0, result.output
+        assert call("run", store, "--out", seen).exit_code == 0
+        scores.append(json.loads((seen / "metrics.json").read_text("utf-8"))["psnr_db"]["captured"])
+    assert scores[0] > scores[1] + 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        (["plan.spread=60 mm"], "plan.spread: a mark of 3 mm at -30, -30 mm is not all on the"),
+        (["plan.size=null"], "plan.size: a plan of kind alignment needs it"),
+        (["optics=null"], "optics: a plan of kind alignment needs optics"),
+        (["alignment=a.json"], "alignment: a plan of kind alignment takes none; drop it"),
+        ([f"plan={json.dumps(PICTURES)}"], "alignment: a plan of kind pictures with optics"),
+        (["plan.betas=[60 rad/mm^2, 50 rad/mm^2]"], "plan.betas: a plan of kind alignment has one"),
+    ],
+)
+def test_files_that_do_not_fit(file, asked, line):
+    assert line in one_line(call("capture", file, *(part for a in asked for part in ("--set", a))))
+
+
+def test_an_alignment_that_cannot_be_read(file):
+    line = one_line(call("capture", file, *pictures("none.json")))
+    assert "none.json" in line
+
+
+@pytest.mark.thorough
+def test_marks_outside_the_field_are_not_found(file):
+    store, moved = file.with_name("c.zarr"), "virtual.monitor.x=200 mm"
+    assert call("capture", file, "--out", store, "--set", moved).exit_code == 0
+    line = one_line(call("run", store, "--out", file.with_name("c")))
+    assert "0 of 9 marks were found and 0 lie within 0.846 mm of a homography" in line
