@@ -280,8 +280,8 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         counts = electron * found.settings[0].exposure * virtual.electrons
         camera = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
     display = found.provenance.get("display_shape") or (virtual and virtual.display) or (768, 1024)
-    given = {"shape": display, "pitch": config.display.pitch, "pictures": picture_levels(config)}
-    render = partial(pattern_levels, **given)
+    given = {"pitch": config.display.pitch, "pictures": picture_levels(config)}
+    render = partial(pattern_levels, shape=tuple(display), **given)
     seconds = store / _SECONDS
     return Taken(
         RigFrames(frames, camera, found.pixels, lit, darks, variance),

@@ -66,10 +66,10 @@ def locate_mark(
         step = np.clip(found[1:3] / found[0], -1, 1)
         shift = shift + step
         if np.abs(step).max() < _CONVERGED:
-            break
-    scores = design * left[:, None]
-    covariance = (known @ (scores.T @ scores) @ known)[1:3, 1:3] / found[0] ** 2
-    return shift, covariance + _SAMPLING**2 * np.eye(2)
+            scores = design * left[:, None]
+            covariance = (known @ (scores.T @ scores) @ known)[1:3, 1:3] / found[0] ** 2
+            return shift, covariance + _SAMPLING**2 * np.eye(2)
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +101,8 @@ class Alignment:
 
     def _errors(self, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         steps = np.diag(np.sqrt(np.diag(self.covariance)))
-        ends = ([function(self.unknowns + s * step) for step in steps] for s in (0.5, -0.5))
-        slopes = np.subtract(*ends)  # over one standard error each
+        ends = [[function(self.unknowns + s * step) for step in steps] for s in (0.5, -0.5)]
+        slopes = np.subtract(ends[0], ends[1])  # over one standard error each
         correlation = self.covariance / np.outer(steps.sum(0), steps.sum(0))
         return np.sqrt(np.einsum("i...,ij,j...->...", slopes, correlation, slopes))
 
@@ -142,7 +142,7 @@ class Alignment:
         """Read such a file; ValueError, one line, for another one."""
         try:
             given = json.loads(read_regular(path))
-            arrays = {name: np.array(given[name]) for name in ("unknowns", "covariance")}
+            arrays = {name: np.array(given[name], float) for name in ("unknowns", "covariance")}
             found = cls(**given | arrays | {"shape": tuple(given["shape"])})
             found.summary()
             return found
@@ -175,7 +175,7 @@ def fit_alignment(
     if len(places) > least:
         given = {"min_samples": least, "residual_threshold": limit, "max_trials": 1000, "rng": 0}
         first, agree = skimage.measure.ransac((shown[there], places), form, **given)
-        used = 0 if agree is None else int(agree.sum())
+        used = 0 if agree is None else int(np.count_nonzero(agree))
     if first is None or used <= least:
         raise MeasurementError(
             f"{len(places)} of {len(seen)} marks were found and {used} lie within {limit:.3g} mm "
