@@ -10,7 +10,7 @@ from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.learn.plug_and_play import noise_mistake
 from thincam_jax.reconstruction.normal_equations import normal_equations
-from thincam_jax.reconstruction.problem import ScaledProblem
+from thincam_jax.reconstruction.problem import ScaledProblem, back_projected
 
 FIELD, SENSOR = (12, 15), (14, 17)
 SIGMA = 0.05
@@ -72,6 +72,21 @@ def test_noise_that_was_told_wrongly_is_found():
         found = normal.solve(right)
         ratio = float(noise_mistake(normal, found, normal.shift, jnp.ones(())))
         assert abs(ratio / wrong - 1) < 0.2
+
+
+def test_the_noise_is_that_of_the_noisiest_part():
+    """Shot noise is three times as strong in the middle; the mean would say 1.4."""
+    rng = np.random.default_rng(4)
+    A = Separable(*(rng.normal(size=n) / 8 for n in ((72, 24), (78, 26))))
+    deviation = np.full((72, 78), SIGMA)
+    deviation[24:48, 26:52] *= 3
+    capture = np.asarray(A(jnp.asarray(rng.random((24, 26))))) + deviation * rng.normal(
+        size=(72, 78)
+    )
+    problem = tc.Recording(jnp.asarray(capture), A, noise_variance=SIGMA**2).problem()
+    normal = normal_equations(problem, jnp.ones(()))
+    found = normal.solve(back_projected(problem, problem.captures))
+    assert abs(float(noise_mistake(normal, found, normal.shift, jnp.ones(()))) / 3 - 1) < 0.1
 
 
 @pytest.mark.thorough

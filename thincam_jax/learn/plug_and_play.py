@@ -44,6 +44,7 @@ from thincam_jax.reconstruction.problem import (
     detector_shape,
     misfit,
     or_one,
+    residuals,
     uniform_image,
 )
 from thincam_jax.reconstruction.recording import Recording
@@ -74,7 +75,8 @@ _TAU, _ITERATIONS = 1.0, 100
 # Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
 _STEP_ERROR = 0.03
 _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
-_LEAST_SHARE = 0.02  # of the pixels, by which the noise can be found
+_LEAST_SHARE = 0.02  # of the noise, that the first data step leaves, by which it can be found
+_PARTS, _SMALLEST = 3, 8  # along each side of a capture, and the pixels that such a part has
 
 
 def as_denoiser(denoiser: Any) -> Any:
@@ -299,28 +301,44 @@ def brightness(image: Image) -> Float[Array, ""]:
 def noise_mistake(
     normal: AbstractNormal, found: Image, shift: Float[Array, ""], precision: Float[Array, ""]
 ) -> Float[Array, ""]:
-    r"""Deviation of the noise in the residual of z over the one given.
+    r"""Deviation of the noise in the residual of z over the one given, where there is most of it.
 
-    Noise alone makes :math:`E \sum w (A z - g)^2 = N - n + s^{-4}\,\mathrm{tr}\,M^{-2}` of N
-    pixels and n unknowns. 1 where that is too few pixels to tell.
+    Of the residual in each part of the captures, over that of white noise of the deviation given,
+    which the data step is tried on: shot noise is strongest where the captures are bright, and so
+    are the object's rays. 1 where that leaves too little noise to tell.
     """
     problem = normal.problem
-    _, once = _probed(normal, shift)
-    count = sum(
-        jnp.sum(jnp.broadcast_to((w > 0).astype(c.dtype), c.shape))
-        for w, c in zip(problem.weights, problem.captures, strict=True)
+    keys = jax.random.split(jax.random.key(0), len(problem.captures))
+    drawn = tuple(
+        jnp.where(w > 0, jax.random.normal(key, c.shape, c.dtype) / jnp.sqrt(or_one(w)), 0)
+        for key, c, w in zip(keys, problem.captures, problem.weights, strict=True)
     )
-    expected = count - found.size + shift**2 * jnp.sum(once**2)
-    residual = 2 * precision * jnp.sum(misfit(problem, found))
-    ratio = jnp.sqrt(residual / or_one(expected))
-    known = (expected > _LEAST_SHARE * count) & jnp.isfinite(ratio)
-    return jnp.where(known, jnp.clip(ratio, 1 / _LARGEST_MISTAKE, _LARGEST_MISTAKE), 1)
+    white = eqx.tree_at(lambda p: p.captures, problem, drawn)
+    fitted = _roughly(normal.shifted(shift), back_projected(white, drawn))
+    pairs = (_local_power(p, image) for p, image in ((problem, found), (white, fitted)))
+    ratios = [
+        jnp.where(known > _LEAST_SHARE, precision * seen / or_one(known), 0)
+        for seen, known in zip(*pairs, strict=True)
+    ]
+    most = jnp.sqrt(jnp.max(jnp.concatenate([ratio.ravel() for ratio in ratios])))
+    trusted = (most > 0) & jnp.isfinite(most)
+    return jnp.where(trusted, jnp.clip(most, 1 / _LARGEST_MISTAKE, _LARGEST_MISTAKE), 1)
 
 
-def _probed(normal: AbstractNormal, shift):
-    """Random signs v, and (AᵀwA + μ)⁻¹ v."""
-    signs = _signs(normal)
-    return signs, _roughly(normal.shifted(shift), signs)
+def _local_power(problem: InverseProblem, image: Image) -> list[Array]:
+    """Means of w (A f − g)² over parts of each capture, of _PARTS along each of its axes."""
+    means = []
+    for r, w, o in zip(residuals(problem, image), problem.weights, problem.operators, strict=True):
+        power, sides = w * r**2, detector_shape(o)
+        if min(sides) < _SMALLEST * _PARTS:
+            means.append(jnp.mean(power))
+            continue
+        for axis, side in enumerate(sides, power.ndim - len(sides)):
+            power = jnp.moveaxis(power, axis, 0)[: side // _PARTS * _PARTS]
+            power = power.reshape(_PARTS, -1, *power.shape[1:]).mean(axis=1)
+            power = jnp.moveaxis(power, 0, axis)
+        means.append(power)
+    return means
 
 
 def _signs(normal: AbstractNormal) -> Image:
