@@ -315,18 +315,15 @@ def noise_mistake(
     )
     white = eqx.tree_at(lambda p: p.captures, problem, drawn)
     fitted = _roughly(normal.shifted(shift), back_projected(white, drawn))
-    pairs = (_local_power(p, image) for p, image in ((problem, found), (white, fitted)))
-    ratios = [
-        jnp.where(known > _LEAST_SHARE, precision * seen / or_one(known), 0)
-        for seen, known in zip(*pairs, strict=True)
-    ]
-    most = jnp.sqrt(jnp.max(jnp.concatenate([ratio.ravel() for ratio in ratios])))
+    seen, known = (_local_power(p, image) for p, image in ((problem, found), (white, fitted)))
+    ratios = jnp.where(known > _LEAST_SHARE, precision * seen / or_one(known), 0)
+    most = jnp.sqrt(jnp.max(ratios))
     trusted = (most > 0) & jnp.isfinite(most)
     return jnp.where(trusted, jnp.clip(most, 1 / _LARGEST_MISTAKE, _LARGEST_MISTAKE), 1)
 
 
-def _local_power(problem: InverseProblem, image: Image) -> list[Array]:
-    """Means of w (A f − g)² over parts of each capture, of _PARTS along each of its axes."""
+def _local_power(problem: InverseProblem, image: Image) -> Array:
+    """Means of w (A f − g)² over captures and their parts, of _PARTS along each axis."""
     means = []
     for r, w, o in zip(residuals(problem, image), problem.weights, problem.operators, strict=True):
         power, sides = w * r**2, detector_shape(o)
@@ -337,8 +334,8 @@ def _local_power(problem: InverseProblem, image: Image) -> list[Array]:
             power = jnp.moveaxis(power, axis, 0)[: side // _PARTS * _PARTS]
             power = power.reshape(_PARTS, -1, *power.shape[1:]).mean(axis=1)
             power = jnp.moveaxis(power, 0, axis)
-        means.append(power)
-    return means
+        means.append(power.mean(axis=tuple(range(power.ndim - len(sides)))))
+    return sum(means[1:], start=means[0]) / len(means)
 
 
 def _signs(normal: AbstractNormal) -> Image:
