@@ -182,12 +182,13 @@ class ScreenStudy:
         program.
         """
         systems = [self.system(model) for model in self.models]
-        if self.mask is not None:
+        matrices = [system for system in systems if isinstance(system, Sparse)]
+        if len(matrices) < len(systems):
             return systems
-        most = max(system.values.size for system in systems)
+        most = max(system.values.size for system in matrices)
         outside = math.prod(systems[0].out_shape), math.prod(systems[0].in_shape)
 
-        def padded(system: Sparse) -> Sparse:
+        def padded(system: Sparse) -> Sparse | MaskSystem:
             entries = system.values, system.rows, system.columns
             longer = [
                 jnp.pad(entry, (0, most - entry.size), constant_values=value)
@@ -195,10 +196,10 @@ class ScreenStudy:
             ]
             return eqx.tree_at(lambda s: (s.values, s.rows, s.columns), system, longer)
 
-        return [padded(system) for system in systems]
+        return [padded(system) for system in matrices]
 
     def system(self, model: ScreenModel) -> Sparse | MaskSystem:
-        """The matrix of one model, or its operator, from the cells to the sensor."""
+        """The matrix of one model, from the cells to the sensor."""
         cameras = self.cameras
         if model.glass_thickness is not None:
             cameras = [with_glass(camera, model.glass_thickness) for camera in cameras]

@@ -26,7 +26,8 @@ from thincam_jax._core.quantity import FieldError, check_fields, choice, quantit
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Scaled, Sparse
+from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatrix, Scaled, Sparse
+from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.measured import calibration as measuring
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, Order
 from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS, QUANTITIES
@@ -108,7 +109,10 @@ class SystemMatrix(eqx.Module):
 
 
 def measure_matrix(
-    study: ScreenStudy, calibration: Calibration, system: Sparse, folder: Path | None = None
+    study: ScreenStudy,
+    calibration: Calibration,
+    system: AbstractOperator,
+    folder: Path | None = None,
 ) -> SystemMatrix:
     """The matrix of a camera from simulated captures of Hadamard patterns.
 
@@ -116,7 +120,7 @@ def measure_matrix(
     - `folder`: of the store of captures; default a temporary one.
     """
     plane, sensor = study.plane, study.camera.sensor
-    brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
+    brightest = float(jnp.max(system(jnp.ones(plane.shape, dtype_of(system)))))
     counts = calibration.exposure * (2**calibration.bits - 1 - calibration.offset) / brightest
     key = jax.random.fold_in(jax.random.key(study.seed), int(1000 * plane.distance))
     series = calibration.series(plane.shape)
@@ -263,6 +267,8 @@ class CalibrationRun:
                 f"a calibration takes a hologram of one colour, not {len(study.cameras)}; give the "
                 "study one camera"
             )
+        if study.mask is not None:
+            raise ValueError("a calibration fits a camera with a lens; give a study without a mask")
         self.study, self.calibration, self.folder = study, calibration, folder
         self.methods: dict[str, Reconstructed] = {}
         self.distances: dict[str, dict[str, DistanceScores]] = {}
@@ -391,7 +397,7 @@ def _columns(
     numbers = np.ravel_multi_index(tuple(np.transpose(cells)), shape)
     lit = np.zeros((len(cells), math.prod(shape)))
     lit[np.arange(len(cells)), numbers] = measured.counts
-    exact: Array = system(jnp.asarray(lit.reshape(-1, *shape), system.values.dtype))
+    exact: Array = system(jnp.asarray(lit.reshape(-1, *shape), dtype_of(system)))
     assert isinstance(measured.matrix, Matrix)
     found = np.asarray(measured.matrix.matrix[:, numbers], float).T
     return {"measured": found.reshape(exact.shape), "exact": np.asarray(exact, float)}
