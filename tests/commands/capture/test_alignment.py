@@ -9,7 +9,7 @@ from commands.capture import tiny
 from commands.test_cli import call, one_line
 
 from thincam_jax.commands.capture.config import CaptureConfig
-from thincam_jax.commands.capture.run import picture_levels
+from thincam_jax.commands.capture.run import build_study, picture_levels
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.study.build import picture
 from thincam_jax.hardware.virtual.optics import MonitorPose, cells_seen
@@ -64,6 +64,8 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
     config = load_as(CaptureConfig, store / "config.yaml")
     (levels,) = picture_levels(config).values()
     (target,), to_cells = config.targets, np.diag([1 / 2.5, 1 / 2.5, 1.0])
+    (scene,) = build_study(config, (96, 112)).targets  # what is compared is what was shown
+    np.testing.assert_allclose(scene.plane.image, picture(target, (16, 16)), atol=1e-6)
     wanted, inner = picture(target, (16, 16)), slice(4, 12)  # the display is not as high
     for pose, least, most in (matrix, 0.98, 1.0), (np.eye(3), -1.0, 0.7):
         seen = cells_seen(levels, (16, 16), to_cells @ pose @ np.diag([0.5, 0.5, 1.0]))

@@ -206,8 +206,8 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
 
     def grey(entry: PictureConfig) -> Target:
         """Of one light: colours are averaged."""
-        seen = optics.object
-        target = Target.of_image(entry.name, picture(entry), seen.distance, seen.width, entry.kind)
+        seen, shown = optics.object, picture(entry, config.cells if monitor else None)
+        target = Target.of_image(entry.name, shown, seen.distance, seen.width, entry.kind)
         image = target.plane.image.mean(axis=0)
         return replace(target, plane=ImagePlane(image, target.distance, target.width))
 
