@@ -7,6 +7,10 @@ from thincam_jax.imaging.refractive_index import bk7 as bk7
 from thincam_jax.waveguide.camera import Rectangle as Rectangle
 from thincam_jax.waveguide.camera import Screen as Screen
 from thincam_jax.waveguide.camera import SeeThroughCamera as SeeThroughCamera
+from thincam_jax.waveguide.colours import ColourBand as ColourBand
+from thincam_jax.waveguide.colours import ColourCamera as ColourCamera
+from thincam_jax.waveguide.colours import colour_system as colour_system
+from thincam_jax.waveguide.colours import trace_colours as trace_colours
 from thincam_jax.waveguide.efficiency import diffraction_efficiency as diffraction_efficiency
 from thincam_jax.waveguide.efficiency import ghost_weights as ghost_weights
 from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram

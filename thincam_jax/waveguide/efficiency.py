@@ -89,7 +89,7 @@ def weights_about(
 
     @jax.checkpoint  # or derivatives would keep every node of every ray
     def contributions(offset):
-        te, tm = _unpolarised(hologram, tangential, centre + offset / slope)
+        te, tm = unpolarised(hologram, tangential, centre + offset / slope)
         parts = [0.5 * (te**2 * (1 - te) ** k + tm**2 * (1 - tm) ** k) for k in range(orders)]
         return tuple(parts)
 
@@ -141,7 +141,7 @@ def band_about(
     """From ξ = −10π to 10π about the Bragg wavelengths, in `nodes` even steps."""
     slope = _band_slope(hologram, tangential, centre)
     wavelengths = centre[..., None] + _offsets(nodes, slope.dtype) / slope[..., None]
-    eta = jnp.stack(_unpolarised(hologram, tangential[..., None, :], wavelengths))
+    eta = jnp.stack(unpolarised(hologram, tangential[..., None, :], wavelengths))
     return Band(wavelengths, _step(slope, nodes), eta)
 
 
@@ -154,8 +154,8 @@ def _step(slope, nodes: int):
     return 20 * math.pi / nodes / jnp.abs(slope)
 
 
-def _unpolarised(hologram, tangential, wavelength):
-    """η for TE and for TM."""
+def unpolarised(hologram, tangential, wavelength) -> list[Float[Array, "*ray"]]:
+    """η for TE and for TM, as of `diffraction_efficiency`."""
     strength, detuning, overlap, reflected = _coupling(hologram, tangential, wavelength)
     return [_efficiency(nu, detuning, reflected) for nu in (strength, strength * overlap)]
 

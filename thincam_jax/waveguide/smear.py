@@ -19,8 +19,16 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.waveguide.camera import SeeThroughCamera
-from thincam_jax.waveguide.efficiency import band_about, in_blocks, least_nodes
-from thincam_jax.waveguide.rays import RayStatus, at_rear, bragg_rays, on_object, shift, straight_on
+from thincam_jax.waveguide.efficiency import Band, band_about, in_blocks, least_nodes
+from thincam_jax.waveguide.rays import (
+    BraggRays,
+    RayStatus,
+    at_rear,
+    bragg_rays,
+    on_object,
+    shift,
+    straight_on,
+)
 
 
 class SmearedRays(eqx.Module):
@@ -28,11 +36,12 @@ class SmearedRays(eqx.Module):
 
     - `points`: (x, y) on the object's plane, mm, of equal parts of the light, (order, *pixel,
       sample, 2).
-    - `weight`: ∫ η²(1−η)^m dλ over the guided light that meets the holograms, (order, *pixel), mm.
+    - `weight`: ∫ η²(1−η)^m dλ over the guided light that meets the holograms, (order, *pixel), mm;
+      where samples have colours, as many times that of each.
     """
 
     points: Float[Array, "order *pixel sample 2"]
-    weight: Float[Array, "order *pixel"]
+    weight: Float[Array, "order ..."]
 
 
 @eqx.filter_jit
@@ -66,6 +75,44 @@ def trace_band(
 def _one(camera, pixel, distance, counts):
     """The centre (2) of a pixel's samples, their offsets (order, sample, 2), and weights."""
     orders, samples, nodes = counts
+    light = guided_band(camera, pixel, nodes)
+    rays, band = light.rays, light.band
+
+    def contact(passed, odd):
+        met = light.on_bottom(camera, odd)
+        arrives = jnp.mean(band.eta**2 * passed, axis=0) * met * light.sound
+        ends = on_object(camera, rays.slope, odd * light.bounce + 2 * light.crossing)
+        return (1 - met * band.eta) * passed, equal_parts(arrives, ends, samples)
+
+    odd = 2 * jnp.arange(orders, dtype=light.sound.dtype) + 1
+    _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
+    return straight_on(camera, rays.slope, distance), parts, weight * band.step
+
+
+class GuidedBand(eqx.Module):
+    """The band of a pixel in the glass, and where it meets the top hologram.
+
+    - `tangential`: **p** of the guided light, (node, 2).
+    - `bounce`, `crossing`: its path and that of the light before the hologram along the glass, mm.
+    - `top`: (x, y) on the top hologram, mm.
+    - `sound`: share of each node's light that is guided and meets the top hologram.
+    """
+
+    rays: BraggRays
+    band: Band
+    tangential: Float[Array, "node 2"]
+    bounce: Float[Array, "node 2"]
+    crossing: Float[Array, "node 2"]
+    top: Float[Array, "node 2"]
+    sound: Float[Array, " node"]
+
+    def on_bottom(self, camera: SeeThroughCamera, odd: Array) -> Float[Array, " node"]:
+        """Share of each node's light that meets the bottom hologram after so many crossings."""
+        return _on(camera.screen.bottom, self.top + odd * self.bounce)
+
+
+def guided_band(camera: SeeThroughCamera, pixel: Float[Array, "2"], nodes: int) -> GuidedBand:
+    """Follow the band of one pixel up to where it is guided."""
     screen = camera.screen
     hologram, width = screen.hologram, screen.glass_thickness
     rays = bragg_rays(camera, pixel)
@@ -83,16 +130,7 @@ def _one(camera, pixel, distance, counts):
     top = at_rear(camera, rays.slope) + crossing
     sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * _on(screen.top, top)
     sound = jnp.where(carried & (rays.fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
-
-    def contact(passed, odd):
-        met = _on(screen.bottom, top + odd * bounce)
-        light = jnp.mean(band.eta**2 * passed, axis=0) * met * sound
-        ends = on_object(camera, rays.slope, odd * bounce + 2 * crossing)
-        return (1 - met * band.eta) * passed, _parts(light, ends, samples)
-
-    odd = 2 * jnp.arange(orders, dtype=centre.dtype) + 1
-    _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
-    return straight_on(camera, rays.slope, distance), parts, weight * band.step
+    return GuidedBand(rays, band, tangential, bounce, crossing, top, sound)
 
 
 def _on(hologram, places):
@@ -112,14 +150,14 @@ def _covered(margin):
     return jnp.where(change > 0, part, (margin > 0).astype(margin.dtype))
 
 
-def _parts(light, ends, samples: int):
-    """Means of `samples` equal parts of a distribution, (sample, 2), and its sum."""
+def equal_parts(light, ends, samples: int):
+    """Means of `ends` in `samples` equal parts of a distribution, (sample, n), and its sum."""
     total = jnp.sum(light)
     share = light / jnp.where(total > 0, total, 1)
     middle = jnp.matmul(share, ends, precision="highest")
     below = jnp.concatenate([jnp.zeros(1, share.dtype), jnp.cumsum(share)])
     moments = jnp.cumsum(share[:, None] * (ends - middle), axis=0)
-    moments = jnp.concatenate([jnp.zeros((1, 2), share.dtype), moments])
+    moments = jnp.concatenate([jnp.zeros_like(moments[:1]), moments])
     marks = jnp.linspace(0, 1, samples + 1, dtype=share.dtype) * below[-1]
     at = jax.vmap(jnp.interp, (None, None, 1), 1)(marks, below, moments)
     return middle + samples * jnp.diff(at, axis=0), total

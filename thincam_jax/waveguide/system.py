@@ -190,10 +190,11 @@ def require_same(what: str, parts: str, shapes: Sequence[tuple[int, ...]]) -> tu
 
 def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: float):
     """H of pixels that see squares of the object of that size, mm; `level`: what weight is 1."""
-    weight = np.asarray(rays.weight)
-    orders, pixels = weight.shape[0], weight[0].size
-    points = np.asarray(rays.points).reshape(orders, pixels, -1, 2)
-    weight = weight.reshape(orders, pixels, 1) / weight.dtype.type(level * points.shape[2])
+    weight, points = np.asarray(rays.weight), np.asarray(rays.points)
+    orders, *pixels, samples, _ = points.shape
+    pixels = math.prod(pixels)
+    points = points.reshape(orders, pixels, samples, 2)
+    weight = weight.reshape(orders, pixels, -1) / weight.dtype.type(level * samples)
     rows, columns = plane.shape
     total = scipy.sparse.csr_array((pixels, rows * columns), dtype=weight.dtype)
     # Order by order, for the memory; entries at the same place are added up.
