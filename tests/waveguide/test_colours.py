@@ -12,6 +12,7 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators import adjoint_error
+from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
 
 RECORDED = ((633 * nm, 60 * deg), (532 * nm, 61.2 * deg), (473 * nm, 62 * deg))
@@ -23,13 +24,13 @@ def gratings(recorded=RECORDED, modulation=0.012):
     return [wg.VolumeHologram.record(c, 0.0, a, **made) for c, a in recorded]
 
 
-def bands(*centres, width=70 * nm, profile="gaussian"):
-    return [wg.ColourBand(c * nm, width, profile) for c in centres or (610, 535, 465)]
+def bands(width=70 * nm):
+    return [wg.ColourBand(c * nm, width) for c in (610, 535, 465)]
 
 
-def camera(films=None, sensor=None, responses=None, **others):
+def camera(films=None, sensor=None, responses=None, bottom=None, **others):
     sensor = sensor or tc.Sensor((4, 3), 500 * um)
-    screens = [wg.Screen(film, GLASS, INDEX) for film in films or gratings()]
+    screens = [wg.Screen(film, GLASS, INDEX, bottom=bottom) for film in films or gratings()]
     cameras = [wg.SeeThroughCamera(screen, sensor, PINHOLE, GAP) for screen in screens]
     return wg.ColourCamera(cameras, responses or bands(), **others)
 
@@ -79,7 +80,7 @@ def test_two_gratings_of_one_film_are_coupled_waves(second, modulation, most, al
     both, own = camera(films), jnp.zeros((len(waves), 2))
     for number, vector in enumerate(vectors):
         guided = -waves[:, None] / (2 * np.pi) * vector[:2]
-        found = both.coupled(jnp.asarray(number), jnp.asarray(guided), jnp.asarray(waves))[0][0]
+        found = both.coupled(jnp.asarray(guided), jnp.asarray(waves))[0][number][0]
         whole = np.sum(exact[number] ** 2)
         assert np.sum(np.asarray(found) ** 2) == pytest.approx(whole, rel=most)
         by_itself = wg.diffraction_efficiency(films[number], own, jnp.asarray(waves))
@@ -104,17 +105,15 @@ def kogelnik(K, t, wavelength, modulation=0.012):
     return np.stack(found)
 
 
-def coupled(g, there, own, separate):
-    """η of the grating g beside the others: of films in their order, or the mean of all orders."""
+def coupled(g, there, own):
+    """η of the grating g beside the others, the mean of all orders in which light may meet them."""
     lost = [1 - (1 - eta) * (1 - guided) for eta, guided in zip(there, own, strict=True)]
-    if separate:
-        return own[g] * np.prod([np.ones_like(own[g]), *(1 - part for part in lost[:g])], axis=0)
     others = lost[:g] + lost[g + 1 :]
     steps = (np.arange(50) + 0.5) / 50
     return own[g] * np.mean([np.prod([1 - u * o for o in others], axis=0) for u in steps], axis=0)
 
 
-def summed(camera, films, pixel, picture, orders, crossed=True, separate=False):
+def summed(camera, films, pixel, picture, orders, crossed=True):
     """Light of each channel of a pixel, a sum over wavelengths, gratings and orders.
 
     `picture`: for each primary rows and columns of cells, whose product is its radiance.
@@ -137,9 +136,7 @@ def summed(camera, films, pixel, picture, orders, crossed=True, separate=False):
         outside = [p + wave[:, None] / (2 * np.pi) * k[:2] for k in K]
         own = [kogelnik(k, o, wave) for k, o in zip(K, outside, strict=True)]
 
-        ways = [
-            coupled(g, [kogelnik(k, outside[g], wave) for k in K], own, separate) for g in numbers
-        ]
+        ways = [coupled(g, [kogelnik(k, outside[g], wave) for k in K], own) for g in numbers]
         kept = np.prod([1 - eta for eta in own], axis=0)
         for into in numbers if crossed else [out]:
             e = outside[into]
@@ -166,16 +163,16 @@ def summed(camera, films, pixel, picture, orders, crossed=True, separate=False):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("crosstalk", "separate"), [("all", False), ("bands", True)])
-def test_captures_are_sums_over_wavelengths(crosstalk, separate):
+@pytest.mark.parametrize("crosstalk", ["all", "bands"])
+def test_captures_are_sums_over_wavelengths(crosstalk):
     """Of 12 pixels and 3 colours, of 2 orders and 9 ways through the gratings."""
     random, films = np.random.default_rng(4), gratings()
     picture = [(random.uniform(size=12), random.uniform(size=16)) for _ in range(3)]
-    both = camera(films, separate=separate)
+    both = camera(films)
     operator = wg.colour_system(both, plane(), 2, 32, crosstalk)
     found = operator(jnp.stack([jnp.outer(*p)[None] for p in picture]))
     pixels = np.asarray(wg.pixel_centres(both.cameras[0])).reshape(-1, 2)
-    way = functools.partial(summed, both, films, crossed=crosstalk == "all", separate=separate)
+    way = functools.partial(summed, both, films, crossed=crosstalk == "all")
     light, level = np.moveaxis([way(pixel, picture, 2) for pixel in pixels], 1, 0)
     expected = (light / level.mean(axis=0)).T.reshape(found.shape)
     print(relative_l2(found, expected))
@@ -183,3 +180,25 @@ def test_captures_are_sums_over_wavelengths(crosstalk, separate):
     assert adjoint_error(operator, jax.random.key(1)) < 1e-13
     own = wg.colour_system(both, plane(), 2, 32, "none")
     assert relative_l2(own(jnp.stack([jnp.outer(*p)[None] for p in picture])), found) > 0.05
+
+
+@pytest.mark.thorough
+def test_a_plan_says_whether_cross_talk_matters():
+    """True errors at most the predicted ones; sharper responses need no cross-talk."""
+    sensor, picture = tc.Sensor((16, 12), 130 * um), sample_image("astronaut")
+    picture = np.moveaxis(resize(picture, (12, 16)), -1, 0)
+    lit = wg.LitPlane(plane(), picture)
+    edge = wg.Rectangle((0.0, 20.0), (400.0, 40.0))
+    for width, tolerance, crosstalk in ((70 * nm, 3e-3, "all"), (30 * nm, 0.3, "none")):
+        both = camera(sensor=sensor, responses=bands(width), bottom=edge)
+        plan = wg.plan(both, lit, tolerance=tolerance)
+        counts = 4, 32, "all", plan.level  # the bottom hologram ends after three
+        exact = wg.colour_system(both, plan.plane, *counts)(jnp.asarray(picture)[:, None])
+        found = plan.system()(jnp.asarray(picture, plan.precision)[:, None])
+        true = relative_l2(np.asarray(found, float), exact)
+        print(plan, true, sep="\n")
+        assert true <= plan.predicted_error <= max(8 * true, 1e-4)
+        assert plan.meets_tolerance and plan.crosstalk == crosstalk
+        assert f"cross-talk  {crosstalk}: " in str(plan)
+    with pytest.raises(ValueError, match=r"images are .*12, 16.*; give \(3, 'y', 'x'\), of one"):
+        wg.plan(both, wg.LitPlane(plane(), picture[0]), tolerance=0.1)

@@ -10,7 +10,6 @@ from thincam_jax.waveguide.camera import SeeThroughCamera as SeeThroughCamera
 from thincam_jax.waveguide.colours import ColourBand as ColourBand
 from thincam_jax.waveguide.colours import ColourCamera as ColourCamera
 from thincam_jax.waveguide.colours import colour_system as colour_system
-from thincam_jax.waveguide.colours import trace_colours as trace_colours
 from thincam_jax.waveguide.efficiency import diffraction_efficiency as diffraction_efficiency
 from thincam_jax.waveguide.efficiency import ghost_weights as ghost_weights
 from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram

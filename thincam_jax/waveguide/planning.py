@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax.imaging.operators import Separable, Sparse
 from thincam_jax.imaging.refractive_index import ConstantIndex
 from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.colours import ColourCamera, Crosstalk, colour_system, modelled
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres, trace
 from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import (
@@ -38,20 +40,21 @@ _PIXELS, _POOL = 192, (96, 32)
 # separated, whose error is largest at the ends of few columns.
 _MARGIN, _LARGEST, _APART = 1.2, 2.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
-_SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
+_SHARES = {"orders": 0.4, "crosstalk": 0.6, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
 # Rounding of the sums of a capture.
 _SUMS: dict[Precision, float] = {"float32": 3e-7, "float64": 1e-14}
 
 
 class LitPlane(eqx.Module):
-    """A flat object and its light: `image`, the radiances of its cells, (y, x)."""
+    """A flat object and the radiances of its cells, for a `ColourCamera` (channel, y, x)."""
 
     plane: ObjectPlane
-    image: Float[Array, "y x"]
+    image: Float[Array, "*channel y x"]
 
     def __init__(self, plane: ObjectPlane, image: Numbers):
         self.plane = plane
-        self.image = checks.finite("image", image, "radiance", shape=plane.shape)
+        shape = *np.shape(image)[-3:-2], *plane.shape
+        self.image = checks.finite("image", image, "radiance", shape=shape)
         if not checks.is_traced(self.image) and not np.asarray(self.image).any():
             raise ValueError("image is dark, and errors are relative to its capture; give light")
 
@@ -73,9 +76,10 @@ class Plan:
     - `level`: weight, mm, that counts as 1: the mean over pixels of the sum over all orders.
     - `shares`: errors of the single decisions. `simpler`: predicted ones of `separable`, and of
       `shift-invariant`: a convolution, with the ghosts of the sensor's middle everywhere.
+    - `crosstalk`: as of `colour_system`, of a `ColourCamera`; `level` is then of each channel.
     """
 
-    camera: SeeThroughCamera
+    camera: SeeThroughCamera | ColourCamera
     plane: ObjectPlane | tuple[ObjectPlane, ...]
     tolerance: float
     predicted_error: float
@@ -85,9 +89,10 @@ class Plan:
     dispersion: bool
     field_dependent: bool
     precision: Precision
-    level: float
+    level: float | tuple[float, ...]
     shares: dict[str, float]
     simpler: dict[str, float]
+    crosstalk: Crosstalk | None = None
 
     @property
     def meets_tolerance(self) -> bool:
@@ -108,6 +113,8 @@ class Plan:
             ("precision", f"{self.precision}{share['precision']}"),
             ("field", f"{field} (predicted with {simpler})"),
         ]
+        if self.crosstalk is not None:
+            lines[-1] = "cross-talk", f"{self.crosstalk}{share['crosstalk']}"
         width = max(len(name) for name, _ in lines)
         return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
 
@@ -117,6 +124,8 @@ class Plan:
         with allow(self.precision, camera):
             camera, plane = cast((camera, self.plane), self.precision)
             counts = self.orders, self.samples
+            if self.crosstalk is not None:
+                return colour_system(camera, plane, *counts, self.crosstalk, self.level)
             if self.field_dependent:
                 return planes_operator(camera, plane, counts, self.level)
             assert isinstance(plane, ObjectPlane)  # several planes are never separated
@@ -124,7 +133,10 @@ class Plan:
 
 
 def plan(
-    camera: SeeThroughCamera, scene: LitPlane | Sequence[LitPlane], *, tolerance: float
+    camera: SeeThroughCamera | ColourCamera,
+    scene: LitPlane | Sequence[LitPlane],
+    *,
+    tolerance: float,
 ) -> Plan:
     r"""Choose the cheapest model of the capture of a scene to a relative error.
 
@@ -134,6 +146,9 @@ def plan(
     rows and columns can be separated; the precision. All are compared with g₀ at 192 pixels,
     half of them where the object's light arrives; no whole capture is computed. Of a scene of
     several planes, each of as many cells, the light adds up, and rows and columns stay together.
+
+    Of a `ColourCamera`, before one plane, the cross-talk is decided in place of dispersion and of
+    rows and columns, and g₀ has the light of all ways through the gratings and 32 parts of each.
 
     A plane wave per pixel, thin holograms and Kogelnik's efficiency are common to all models, as is
     the end of each band at |ξ| = 10π, beyond which lie some 1e-3 of the light.
@@ -152,8 +167,15 @@ def plan(
     plane = scene.plane if isinstance(scene, LitPlane) else tuple(one.plane for one in lit)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
         raise TypeError("plan needs known numbers: call it outside of jit and grad")
+    channels = (camera.channels[1],) if isinstance(camera, ColourCamera) else ()
+    if any(one.image.shape[:-2] != channels for one in lit) or len(lit) > 1 and channels:
+        shapes = [one.image.shape for one in lit]
+        raise ValueError(
+            f"images are {shapes}; give {(*channels, 'y', 'x')}, of one plane in colours"
+        )
+    kind = _ColourProbe if channels else _Probe
     with allow("float64", camera, lit):
-        probe = _Probe(*cast((camera, lit), "float64"))
+        probe = kind(*cast((camera, lit), "float64"))
         share = 1.0
         while True:
             made = probe.plan(camera, plane, tolerance, share)
@@ -182,40 +204,55 @@ class _Rays:
 class _Probe:
     """A scene at some pixels: the reference capture, and the errors of other models."""
 
+    rounding: dict[Any, float] = {**_SUMS}
+    level: Any
+
     def __init__(self, camera: SeeThroughCamera, scene: tuple[LitPlane, ...]):
-        self.camera, self.planes = camera, [one.plane for one in scene]
+        seen = self._draw(camera, [one.plane for one in scene], [one.image for one in scene])
         screen = camera.screen
         indices = screen.hologram.index, screen.glass_index
         self.dispersive = not all(isinstance(index, ConstantIndex) for index in indices)
-        self.sizes = [float(seen_size(camera, plane)) for plane in self.planes]
-        for plane, size in zip(self.planes, self.sizes, strict=True):
-            footprints(np.zeros((1, 2)), plane, size)  # refuses cells that are too small
-        images = [np.asarray(one.image) for one in scene]
-        self.sums = [np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0),) * 2) for image in images]
-        pool = _spread(camera)
-        light = [self._lit(pool, number) for number in range(len(scene))]
-        chosen, self.counts = _drawn(np.sum(light, axis=0))
-        # The middle first, for the shift-invariant model.
-        self.pixels = np.concatenate([np.zeros((1, 2)), pool[chosen]])
-        each = [_orders_seen(camera, plane, self.pixels) for plane in self.planes]
-        seen = np.max(each, axis=0)
-        self.all_orders = int(seen.max())
-        self._traced: dict = {}
         rays = self.rays(True, "float64")
         self.level = float(np.average(np.sum(rays.weight, axis=0)[1:], weights=self.counts))
         if self.level == 0:
             raise ValueError("no light reaches the sensor by this screen: see check_screen")
-        self.reference = self.seen(rays)
-        self.norm = 1.0
+        self._refer(self.seen(rays), rays.weight[-1, 1:] / self.level, seen)
+
+    def _draw(self, camera: SeeThroughCamera, planes: list, images: Any) -> np.ndarray:
+        """Choose pixels by the light of planes; how many orders can meet them at each pixel."""
+        self.options: dict[str, tuple] = {
+            "orders": _ORDERS,
+            "smear": _SAMPLES,
+            "dispersion": (False, True),
+            "precision": ("float32", "float64"),
+        }
+        self.camera, self.planes, self._traced = camera, planes, {}
+        self.sizes = [float(seen_size(camera, plane)) for plane in self.planes]
+        for plane, size in zip(self.planes, self.sizes, strict=True):
+            footprints(np.zeros((1, 2)), plane, size)  # refuses cells that are too small
+        self.images = [np.asarray(image) for image in images]
+        sums = [image.cumsum(axis=0).cumsum(axis=1) for image in self.images]
+        self.sums = [np.pad(each, ((1, 0),) * 2) for each in sums]
+        pool = _spread(camera)
+        light = [self._lit(pool, number) for number in range(len(planes))]
+        chosen, self.counts = _drawn(np.sum(light, axis=0))
+        # The middle first, for the shift-invariant model.
+        self.pixels = np.concatenate([np.zeros((1, 2)), pool[chosen]])
+        seen = np.max([_orders_seen(camera, plane, self.pixels) for plane in self.planes], axis=0)
+        self.all_orders = int(seen.max())
+        return seen[1:]
+
+    def _refer(self, reference: np.ndarray, last: np.ndarray, seen: np.ndarray) -> None:
+        """Keep the reference (order, …, pixel); `last`: weights of the last order, relative."""
+        self.reference, self.norm = reference, 1.0
         self.norm = self._length(self.reference.sum(axis=0))
         if self.norm == 0:
             raise ValueError("no pixel sees the object's light; give it another place")
         # Orders beyond the last that is computed.
         # Weights fall as i^(−3/2), so that all that follow are at most twice I times the last.
         beyond = np.clip(seen - _ORDERS[-1], 0, 2 * _ORDERS[-1])
-        tail = rays.weight[-1] * beyond / self.level
-        brightness = sum(float(np.sqrt(np.mean(image**2))) for image in images)
-        self.tail = self._length(tail[1:]) * brightness
+        brightness = sum(float(np.sqrt(np.mean(image**2))) for image in self.images)
+        self.tail = self._length(last * beyond) * brightness
 
     def rays(
         self,
@@ -273,62 +310,50 @@ class _Probe:
 
     def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
         """The cheapest decisions, each within its part of the remaining tolerance."""
-        left = tolerance * share / _MARGIN
-        shares = {}
-        orders, size = 1, 0.0
-        for orders in _ORDERS:
-            size = self._length(self.reference[orders:].sum(axis=0))
-            if size <= left * _SHARES["orders"]:
-                break
-        shares["orders"], left = size, max(left - size, 0.0)
-
-        def within(size: float, decision: str) -> bool:
-            return size <= left * _SHARES[decision]
-
-        def capture(*way):
-            return self.seen(self.rays(*way), orders).sum(axis=0)
-
-        so_far = found = self.reference[:orders].sum(axis=0)
-        samples = None
-        for samples in _SAMPLES:
-            found = capture(True, "float64", samples)
-            size = self._length(found - so_far)
-            if within(size, "smear"):
-                break
-        shares["smear"], left, so_far = size, max(left - size, 0.0), found
-        found = capture(False, "float64", samples) if self.dispersive else so_far
-        size = self._length(found - so_far)
-        dispersion = not within(size, "dispersion")
-        shares["dispersion"] = 0.0 if dispersion else size
-        left, so_far = left - shares["dispersion"], so_far if dispersion else found
-        found = capture(dispersion, "float32", samples)
-        size = self._length(found - so_far) + _SUMS["float32"]
-        precision: Precision = "float32" if within(size, "precision") else "float64"
-        shares["precision"] = size if precision == "float32" else _SUMS["float64"]
-        simpler = {
-            "separable": self._separable(dispersion, samples, orders),
-            "shift-invariant": self._shift_invariant(dispersion, samples, orders),
-        }
-        found = capture(dispersion, precision, samples)
-        rounded = shares["precision"]
-        simpler = {name: _APART * self._predicted(c, rounded) for name, c in simpler.items()}
-        predicted = self._predicted(found, rounded)
-        apart_serves = len(self.planes) == 1 and simpler["separable"] <= tolerance
+        left, shares, found = tolerance * share / _MARGIN, {}, self.reference.sum(axis=0)
+        way: dict[str, Any] = {name: values[-1] for name, values in self.options.items()}
+        for name, values in self.options.items():
+            for value in values:
+                there = self.capture(**(way | {name: value}))
+                size = self._length(there - found) + self.rounding.get(value, 0.0)
+                if size <= left * _SHARES[name] or value == values[-1]:
+                    break
+            way[name], shares[name], found = value, size, there
+            left = max(left - size, 0.0)
+        predicted = self._predicted(found, shares["precision"])
+        simpler = self.simpler(way, shares["precision"])
+        apart = simpler.get("separable", math.inf)
+        apart_serves = len(self.planes) == 1 and apart <= tolerance
         return Plan(
             camera=camera,
             plane=plane,
             tolerance=tolerance,
-            predicted_error=simpler["separable"] if apart_serves else predicted,
-            orders=orders,
+            predicted_error=apart if apart_serves else predicted,
+            orders=way["orders"],
             all_orders=self.all_orders,
-            samples=samples,
-            dispersion=dispersion,
+            samples=way["smear"],
+            dispersion=way["dispersion"],
             field_dependent=not apart_serves,
-            precision=precision,
+            precision=way["precision"],
             level=self.level,
             shares=shares,
             simpler=simpler,
+            crosstalk=way.get("crosstalk"),
         )
+
+    def capture(self, **way: Any) -> np.ndarray:
+        """At the pixels, by one way of the `options`."""
+        rays = self.rays(way["dispersion"] or not self.dispersive, way["precision"], way["smear"])
+        return self.seen(rays, way["orders"]).sum(axis=0)
+
+    def simpler(self, way: dict[str, Any], rounded: float) -> dict[str, float]:
+        """Predicted errors of models that are not among the options."""
+        if "crosstalk" in way:
+            return {}
+        models = {"separable": self._separable, "shift-invariant": self._shift_invariant}
+        counts = way["dispersion"], way["smear"], way["orders"]
+        found = {name: model(*counts) for name, model in models.items()}
+        return {name: _APART * self._predicted(one, rounded) for name, one in found.items()}
 
     def _predicted(self, capture: np.ndarray, rounded: float) -> float:
         """`rounded`: what the precision adds, twice: the operator does not round as the probe."""
@@ -360,6 +385,43 @@ class _Probe:
         points = rays.points[:, :1] + linear[None, :, None, :]
         weight = np.broadcast_to(rays.weight[:, :1], rays.weight.shape)
         return self.seen(_Rays(points, weight), orders).sum(axis=0)
+
+
+class _ColourProbe(_Probe):
+    """A scene in its colours: captures are (channel, pixel)."""
+
+    rounding = {"float32": 2e-5, "float64": 1e-14}  # with that of rays
+
+    def __init__(self, camera: ColourCamera, scene: tuple[LitPlane, ...]):
+        (lit,), self.colours = scene, camera
+        middle = camera.cameras[len(camera.cameras) // 2]
+        seen = self._draw(middle, [lit.plane] * len(lit.image), lit.image)
+        self.options |= {"smear": _SAMPLES[1:-1], "dispersion": (True,)}
+        self.options = {"crosstalk": camera.crosstalk} | self.options
+        counts = min(self.all_orders, _ORDERS[-1]), _SAMPLES[-2]
+        seen_from = jnp.asarray(self.pixels[1:]), lit.plane.distance
+        found = [camera.trace(*seen_from, out, counts) for out in jnp.arange(len(camera.cameras))]
+        self.ways = [[np.asarray(part) for part in each] for each in found]
+        weight = np.sum([each.mean(axis=-1).sum(axis=(0, 2)) for _, each in self.ways], axis=0)
+        level = np.average(weight.sum(axis=1), weights=self.counts, axis=-1)
+        self.level, last = tuple(level.tolist()), weight[:, -1] / level[:, None]
+        best = {name: values[-1] for name, values in self.options.items()}
+        self._refer(self.capture(**best, apart=True), last, seen)
+
+    def capture(self, *, apart: bool = False, **way: Any) -> np.ndarray:
+        """At the pixels, (channel, pixel); `apart`: (order, channel, pixel)."""
+        total, (channels, primaries), smear = 0.0, self.colours.channels, way["smear"]
+        for out, (points, weight) in enumerate(self.ways):
+            points, weight = points[:, : way["orders"]], weight[:, :, :, : way["orders"]]
+            points = points.reshape(*points.shape[:3], smear, -1, 2).mean(axis=-2)
+            weight = weight.reshape(*weight.shape[:-1], smear, -1).mean(axis=-1) / smear
+            ways, channel = np.ogrid[: len(points), :channels]
+            for primary in range(primaries):
+                kept = modelled(way["crosstalk"], ways, channel, primary, out) & (channel >= 0)
+                light = weight[:, :, primary] * kept[..., None, None, None]
+                total += np.einsum("wops,wcops->ocp", self._radiance(points, primary), light)
+        found = np.asarray(total) / np.asarray(self.level)[:, None]
+        return found if apart else found.sum(axis=0)
 
 
 def _separable(camera, plane, size, counts, level) -> Separable:

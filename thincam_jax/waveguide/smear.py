@@ -18,17 +18,9 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax.waveguide.camera import SeeThroughCamera
-from thincam_jax.waveguide.efficiency import Band, band_about, in_blocks, least_nodes
-from thincam_jax.waveguide.rays import (
-    BraggRays,
-    RayStatus,
-    at_rear,
-    bragg_rays,
-    on_object,
-    shift,
-    straight_on,
-)
+from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
+from thincam_jax.waveguide.efficiency import band_about, in_blocks, least_nodes
+from thincam_jax.waveguide.rays import RayStatus, at_rear, bragg_rays, on_object, shift, straight_on
 
 
 class SmearedRays(eqx.Module):
@@ -75,44 +67,23 @@ def trace_band(
 def _one(camera, pixel, distance, counts):
     """The centre (2) of a pixel's samples, their offsets (order, sample, 2), and weights."""
     orders, samples, nodes = counts
-    light = guided_band(camera, pixel, nodes)
-    rays, band = light.rays, light.band
+    rays, band, (_, bounce, crossing, top, sound) = guided_band(camera, pixel, nodes)
 
     def contact(passed, odd):
-        met = light.on_bottom(camera, odd)
-        arrives = jnp.mean(band.eta**2 * passed, axis=0) * met * light.sound
-        ends = on_object(camera, rays.slope, odd * light.bounce + 2 * light.crossing)
-        return (1 - met * band.eta) * passed, equal_parts(arrives, ends, samples)
+        met = meets(camera.screen.bottom, top + odd * bounce)
+        light = jnp.mean(band.eta**2 * passed, axis=0) * met * sound
+        ends = on_object(camera, rays.slope, odd * bounce + 2 * crossing)
+        return (1 - met * band.eta) * passed, equal_parts(light, ends, samples)
 
-    odd = 2 * jnp.arange(orders, dtype=light.sound.dtype) + 1
+    odd = 2 * jnp.arange(orders, dtype=sound.dtype) + 1
     _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
     return straight_on(camera, rays.slope, distance), parts, weight * band.step
 
 
-class GuidedBand(eqx.Module):
-    """The band of a pixel in the glass, and where it meets the top hologram.
-
-    - `tangential`: **p** of the guided light, (node, 2).
-    - `bounce`, `crossing`: its path and that of the light before the hologram along the glass, mm.
-    - `top`: (x, y) on the top hologram, mm.
-    - `sound`: share of each node's light that is guided and meets the top hologram.
-    """
-
-    rays: BraggRays
-    band: Band
-    tangential: Float[Array, "node 2"]
-    bounce: Float[Array, "node 2"]
-    crossing: Float[Array, "node 2"]
-    top: Float[Array, "node 2"]
-    sound: Float[Array, " node"]
-
-    def on_bottom(self, camera: SeeThroughCamera, odd: Array) -> Float[Array, " node"]:
-        """Share of each node's light that meets the bottom hologram after so many crossings."""
-        return _on(camera.screen.bottom, self.top + odd * self.bounce)
-
-
-def guided_band(camera: SeeThroughCamera, pixel: Float[Array, "2"], nodes: int) -> GuidedBand:
-    """Follow the band of one pixel up to where it is guided."""
+def guided_band(camera: SeeThroughCamera, pixel: Float[Array, "2"], nodes: int):
+    """The Bragg ray of a pixel, its band, and of each node of that: **p**, the paths along the
+    plate of guided light and of that before it, the place on the top hologram, and its share that
+    is guided and meets that."""
     screen = camera.screen
     hologram, width = screen.hologram, screen.glass_thickness
     rays = bragg_rays(camera, pixel)
@@ -128,12 +99,12 @@ def guided_band(camera: SeeThroughCamera, pixel: Float[Array, "2"], nodes: int) 
     bounce = width * tangential / jnp.sqrt(jnp.where(carried, left, 1))[:, None]
     crossing = width * shift(across, glass)
     top = at_rear(camera, rays.slope) + crossing
-    sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * _on(screen.top, top)
+    sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * meets(screen.top, top)
     sound = jnp.where(carried & (rays.fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
-    return GuidedBand(rays, band, tangential, bounce, crossing, top, sound)
+    return rays, band, (tangential, bounce, crossing, top, sound)
 
 
-def _on(hologram, places):
+def meets(hologram: Rectangle | None, places: Float[Array, "node 2"]) -> Float[Array, " node"]:
     """Share of the light about each node that meets a hologram."""
     if hologram is None:
         return jnp.ones(places.shape[0], places.dtype)
