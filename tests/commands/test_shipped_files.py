@@ -92,6 +92,7 @@ def but(*slow):
     "fza_superresolution",
     "learned_refocus",
     "sts_calibration",
+    "sts_colours",
 )
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", []

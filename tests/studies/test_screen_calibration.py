@@ -7,6 +7,9 @@ import pytest
 from studies import tiny_screen
 
 import thincam_jax as tc
+from thincam_jax import waveguide as wg
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.studies.screen import ScreenModel
 from thincam_jax.studies.screen_calibration import calibrate, measure_matrix
 from thincam_jax.units import nm
 
@@ -77,7 +80,33 @@ def test_captures_are_kept_where_asked_for(study, keep, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["captures-550mm.zarr"] * keep
 
 
-def test_a_calibration_is_of_one_colour():
-    colours = tiny_screen.study(*(tiny_screen.camera(w * nm) for w in (630, 532, 460)))
-    with pytest.raises(ValueError, match="takes a hologram of one colour, not 3; give the study"):
+@pytest.fixture(scope="module")
+def colours():
+    """Of three gratings and a sensor whose channels overlap."""
+    return tiny_screen.study(
+        *(tiny_screen.camera(w * nm) for w in (633, 532, 473)),
+        responses=tuple(wg.ColourBand(c * nm, 80 * nm) for c in (610, 535, 465)),
+        targets={"face": resize(sample_image("astronaut"), tiny_screen.CELLS)},
+        solvers={"CGM": tc.Ridge(0.1)},
+        models=(ScreenModel("right"), ScreenModel("separated", "no_crosstalk")),
+    )
+
+
+def test_colours_are_calibrated_with_their_cross_talk(colours):
+    """Patterns of each primary: as good as the exact model, better than separated colours."""
+    calibration = dataclasses.replace(tiny_screen.CALIBRATION, distances=())
+    found = calibrate(colours, calibration)
+    assert found.scores.frames == 3 * 2 * 8 * 16
+    spread = found.scores.expected_noise_counts
+    assert found.scores.noise_counts == pytest.approx(spread, rel=0.15)
+    models = {name: model.methods["CGM"] for name, model in colours.run().models.items()}
+    means = {name: method.scores.mean_psnr_db for name, method in models.items()}
+    measured = found.methods["CGM"]
+    assert measured.images.shape == (1, 8, 16, 3)
+    assert measured.scores.mean_psnr_db == pytest.approx(means["right"], abs=2)
+    assert means["right"] > means["separated"] + 10
+
+
+def test_other_distances_are_of_one_colour(colours):
+    with pytest.raises(ValueError, match="distances need a fit, and that one colour; drop"):
         calibrate(colours, tiny_screen.CALIBRATION)

@@ -175,7 +175,6 @@ def test_captures_are_sums_over_wavelengths(crosstalk):
     way = functools.partial(summed, both, films, crossed=crosstalk == "all")
     light, level = np.moveaxis([way(pixel, picture, 2) for pixel in pixels], 1, 0)
     expected = (light / level.mean(axis=0)).T.reshape(found.shape)
-    print(relative_l2(found, expected))
     assert relative_l2(found, expected) < 3e-3
     assert adjoint_error(operator, jax.random.key(1)) < 1e-13
     own = wg.colour_system(both, plane(), 2, 32, "none")
@@ -196,7 +195,6 @@ def test_a_plan_says_whether_cross_talk_matters():
         exact = wg.colour_system(both, plan.plane, *counts)(jnp.asarray(picture)[:, None])
         found = plan.system()(jnp.asarray(picture, plan.precision)[:, None])
         true = relative_l2(np.asarray(found, float), exact)
-        print(plan, true, sep="\n")
         assert true <= plan.predicted_error <= max(8 * true, 1e-4)
         assert plan.meets_tolerance and plan.crosstalk == crosstalk
         assert f"cross-talk  {crosstalk}: " in str(plan)

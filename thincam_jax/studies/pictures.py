@@ -75,7 +75,8 @@ def reconstructed(
     began = time.perf_counter()
     found = reconstruct_targets(system, solver, captures)
     images = np.asarray(found.image, float)
-    images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
+    images = images.reshape(len(targets), -1, *images.shape[-2:])
+    images = images[:, 0] if images.shape[1] == 1 else np.moveaxis(images, 1, -1)
     seconds = time.perf_counter() - began
     pairs = [
         (name, image, truth)

@@ -41,7 +41,9 @@ from thincam_jax.waveguide.system import colour_operator, seen_size, smeared_ray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear"]
+Mistake = Literal[
+    "none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear", "no_crosstalk"
+]
 MISTAKES: dict[Mistake, str] = {
     "none": "as the camera is",
     "grating": "K as printed in thesis Eq 5.4, with cos Θ_O − cos Θ_R: a transmission hologram",
@@ -49,6 +51,7 @@ MISTAKES: dict[Mistake, str] = {
     "shift_invariant": "the ghosts of the axis everywhere: a convolution",
     "no_ghosts": "the first image alone",
     "no_smear": "each pixel's Bragg wavelength alone, without the band about it",
+    "no_crosstalk": "a sensor that separates the colours of the gratings",
 }
 
 GLASS = quantity("mm", positive=True, optional=True)
@@ -94,6 +97,7 @@ class ScreenStudy:
     - `recording_angles`: of the object and the reference wave in the film, rad, which the mistake
       "grating" needs.
     - `mask`: in the place of the lens, before a bare sensor; None for the lens.
+    - `responses`: of a sensor with cross-talk, see `colour_system`; empty: it separates colours.
     - `config`: the sections of the file that it was read from, if any.
 
     ```python
@@ -132,6 +136,7 @@ class ScreenStudy:
     seed: int = 0
     name: str = "screen"
     mask: ScreenMask | None = None
+    responses: tuple[wg.ColourBand, ...] = ()
     config: Any = field(default=None, repr=False)
 
     def __post_init__(self):
@@ -205,6 +210,10 @@ class ScreenStudy:
             cameras = [with_glass(camera, model.glass_thickness) for camera in cameras]
         if self.mask is not None:
             return self.mask.system(cameras[0], self.plane, self.orders, model.mistake)
+        if self.responses and model.mistake in ("none", "no_ghosts"):
+            orders = 1 if model.mistake == "no_ghosts" else self.orders
+            camera = wg.ColourCamera(cameras, self.responses)
+            return wg.colour_system(camera, self.plane, orders, self.band_samples or 1)
         channels = []
         for camera in cameras:
             rays = mistaken_rays(self, camera, model.mistake)

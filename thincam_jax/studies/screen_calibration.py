@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax import waveguide as wg
@@ -104,7 +105,8 @@ class SystemMatrix(eqx.Module):
     def reduce(self, captures: ScreenCaptures) -> ScreenCaptures:
         """Captures in the unit of the matrix, as its reduction takes them."""
         variance = captures.variance.reshape(*captures.variance.shape[:1], -1).mean(axis=1)
-        images = self.reduced.project(self.matrix, self.counts * captures.images)
+        images = captures.images.reshape(len(captures.images), -1)
+        images = self.reduced.project(self.matrix, self.counts * images)
         return ScreenCaptures(images, self.counts**2 * variance)
 
 
@@ -119,21 +121,34 @@ def measure_matrix(
     - `system`: the camera's own matrix.
     - `folder`: of the store of captures; default a temporary one.
     """
-    plane, sensor = study.plane, study.camera.sensor
-    brightest = float(jnp.max(system(jnp.ones(plane.shape, dtype_of(system)))))
+    plane, full = study.plane, math.prod(system.out_shape)
+    brightest = float(jnp.max(system(jnp.ones(system.in_shape, dtype_of(system)))))
     counts = calibration.exposure * (2**calibration.bits - 1 - calibration.offset) / brightest
     key = jax.random.fold_in(jax.random.key(study.seed), int(1000 * plane.distance))
-    series = calibration.series(plane.shape)
-    with _store(folder, f"captures-{float(plane.distance):g}mm.zarr", calibration) as path:
-        with measuring.create_captures(path, series, sensor.shape, bits=calibration.bits) as writer:
-            captures = measuring.simulate_captures(
-                writer,
-                Scaled(system, counts),
-                key,
-                deviation=calibration.noise,
-                offset=calibration.offset,
-            )
-        return SystemMatrix.of(measuring.recover_matrix(captures), counts)
+    series, cells = calibration.series(plane.shape), math.prod(plane.shape)
+    lit = [np.asarray(part) for part in (system.values, system.rows, system.columns)]
+    frame = full // system.out_shape[-1], system.out_shape[-1]  # channels one below the other
+    measured = []
+    for number in range(math.prod(system.in_shape) // cells):  # patterns of each primary
+        kept = (lit[2] // cells == number) & (lit[1] < full)
+        values, rows, columns = (part[kept] for part in lit)
+        table = scipy.sparse.csr_array((values, (rows, columns % cells)), (full, cells))
+        name = f"captures-{float(plane.distance):g}mm{f'-{number}' if number else ''}.zarr"
+        with _store(folder, name, calibration) as path:
+            with measuring.create_captures(path, series, frame, bits=calibration.bits) as writer:
+                captures = measuring.simulate_captures(
+                    writer,
+                    Scaled(Sparse(table, plane.shape, frame), counts),
+                    jax.random.fold_in(key, number) if number else key,
+                    deviation=calibration.noise,
+                    offset=calibration.offset,
+                )
+            measured.append(measuring.recover_matrix(captures))
+    if len(measured) == 1:
+        return SystemMatrix.of(measured[0], counts)
+    matrix = jnp.concatenate([one.matrix for one in measured], axis=1)
+    matrix = Matrix(matrix, (len(measured), *plane.shape), system.out_shape)  # colours as planes
+    return SystemMatrix.of(matrix, counts)
 
 
 @contextlib.contextmanager
@@ -248,7 +263,8 @@ def calibrate(
 
     - `folder`: of the stores of captures; default a temporary one.
 
-    **Errors**: ValueError for a study of several colours.
+    Of several colours each primary has its patterns, and every channel of a frame is read; neither
+    a fit nor other distances follow.
     """
     run = CalibrationRun(study, calibration, folder)
     carry_out(run.work, progress)
@@ -262,11 +278,9 @@ class CalibrationRun:
     fit: measuring.ScreenFit
 
     def __init__(self, study: ScreenStudy, calibration: Calibration, folder: Path | None = None):
-        if len(study.cameras) > 1:
-            raise ValueError(
-                f"a calibration takes a hologram of one colour, not {len(study.cameras)}; give the "
-                "study one camera"
-            )
+        colours = len(study.cameras) > 1
+        if colours and calibration.distances:
+            raise ValueError("distances need a fit, and that one colour; drop distances")
         if study.mask is not None:
             raise ValueError("a calibration fits a camera with a lens; give a study without a mask")
         self.study, self.calibration, self.folder = study, calibration, folder
@@ -277,7 +291,9 @@ class CalibrationRun:
         for name in study.solvers:
             step = partial(self._reconstruct, name)
             self.work.append(Step(f"{MEASURED}: {name}", step))
-        self.work.append(Step("fit of the screen", self._fit))
+        self._fit_scores = FitScores("of one colour alone", (), 0.0, 0.0, {})
+        if not colours:
+            self.work.append(Step("fit of the screen", self._fit))
         for distance in calibration.distances:
             step = partial(self._look_from, distance)
             self.work.append(Step(f"object at {distance:g} mm", step))
@@ -291,7 +307,7 @@ class CalibrationRun:
         of_a_cell = 2 if options.display == "complementary" else 4
         spread = of_a_cell * (options.noise**2 + rounding) / math.prod(self.study.plane.shape)
         scores = CalibrationScores(
-            options.series(self.study.plane.shape).frame_count,
+            options.series(self.study.plane.shape).frame_count * len(self.study.cameras),
             round(self._seconds, 2),
             round(float(self.columns["exact"].max()), 3),
             round(float(noise.std()), 5),
@@ -394,13 +410,15 @@ def _columns(
 ) -> dict[str, Float[np.ndarray, "cell y x"]]:
     """Captures of some cells alone, in counts."""
     system, shape = study.systems[0], study.plane.shape
-    numbers = np.ravel_multi_index(tuple(np.transpose(cells)), shape)
-    lit = np.zeros((len(cells), math.prod(shape)))
+    middle = len(study.cameras) // 2  # colour
+    numbers = np.ravel_multi_index(tuple(np.transpose(cells)), shape) + middle * math.prod(shape)
+    lit = np.zeros((len(cells), math.prod(system.in_shape)))
     lit[np.arange(len(cells)), numbers] = measured.counts
-    exact: Array = system(jnp.asarray(lit.reshape(-1, *shape), dtype_of(system)))
+    exact: Array = system(jnp.asarray(lit.reshape(-1, *system.in_shape), dtype_of(system)))
     assert isinstance(measured.matrix, Matrix)
-    found = np.asarray(measured.matrix.matrix[:, numbers], float).T
-    return {"measured": found.reshape(exact.shape), "exact": np.asarray(exact, float)}
+    found = {"measured": measured.matrix.matrix[:, numbers].T, "exact": exact}
+    frame = len(cells), -1, *study.camera.sensor.shape
+    return {n: np.asarray(each, float).reshape(frame)[:, middle] for n, each in found.items()}
 
 
 def _true_values(study: ScreenStudy) -> dict[str, float]:

@@ -14,7 +14,6 @@ from thincam_jax.waveguide.efficiency import diffraction_efficiency as diffracti
 from thincam_jax.waveguide.efficiency import ghost_weights as ghost_weights
 from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram
 from thincam_jax.waveguide.hologram import refracted as refracted
-from thincam_jax.waveguide.planning import LitPlane as LitPlane
 from thincam_jax.waveguide.planning import Plan as Plan
 from thincam_jax.waveguide.planning import plan as plan
 from thincam_jax.waveguide.rays import Rays as Rays
@@ -27,5 +26,6 @@ from thincam_jax.waveguide.screen_to_sensor import ghost_images as ghost_images
 from thincam_jax.waveguide.screen_to_sensor import ghost_psfs as ghost_psfs
 from thincam_jax.waveguide.smear import SmearedRays as SmearedRays
 from thincam_jax.waveguide.smear import trace_band as trace_band
+from thincam_jax.waveguide.system import LitPlane as LitPlane
 from thincam_jax.waveguide.system import ObjectPlane as ObjectPlane
 from thincam_jax.waveguide.system import system_operator as system_operator

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
-from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
+from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index
 from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
 
@@ -92,3 +92,12 @@ class SeeThroughCamera(Module):
             (-sin_y, cos_y * sin_x, cos_y * cos_x),
         )
         return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def without_dispersion(camera: SeeThroughCamera) -> SeeThroughCamera:
+    """The camera whose indices are, at every wavelength, those of its middle's colour."""
+    screen = camera.screen
+    wavelength, _ = screen.hologram.bragg_wavelength(jnp.zeros(2, camera.sensor.pitch.dtype))
+    indices = (screen.hologram.index, screen.glass_index)
+    constant = [ConstantIndex(index(wavelength)) for index in indices]
+    return eqx.tree_at(lambda c: (c.screen.hologram.index, c.screen.glass_index), camera, constant)

@@ -239,13 +239,12 @@ def colour_system(
     if not min(levels) > 0:
         raise ValueError(f"channels get {found} mm of bandwidth; give others of some light")
     for row, level in zip(blocks, levels, strict=True):
-        row[:] = [None if part is None else part / part.dtype.type(level) for part in row]
+        row[:] = [None if part is None else part * part.dtype.type(1 / level) for part in row]
     whole = (shape[0], *first.sensor.shape)
     return Sparse(scipy.sparse.block_array(blocks), (shape[1], 1, *plane.shape), whole)
 
 
 def modelled(crosstalk: Crosstalk, way: Any, channel: Any, primary: int, out: int) -> Any:
     """Whether a channel has the light of a primary that comes in by `way` and goes `out`."""
-    if crosstalk == "none":
-        return (way == out) & (channel == out) & (primary == out)
-    return (crosstalk == "all") | (way == out) & (channel >= 0)
+    own = (channel == out) & (primary == out) | (crosstalk != "none")
+    return own & ((way == out) | (crosstalk == "all"))

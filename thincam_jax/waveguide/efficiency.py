@@ -154,7 +154,7 @@ def _step(slope, nodes: int):
     return 20 * math.pi / nodes / jnp.abs(slope)
 
 
-def unpolarised(hologram, tangential, wavelength) -> list[Float[Array, "*ray"]]:
+def unpolarised(hologram: VolumeHologram, tangential: Array, wavelength: Array) -> list[Array]:
     """η for TE and for TM, as of `diffraction_efficiency`."""
     strength, detuning, overlap, reflected = _coupling(hologram, tangential, wavelength)
     return [_efficiency(nu, detuning, reflected) for nu in (strength, strength * overlap)]

@@ -5,22 +5,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Numbers
 from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax.imaging.operators import Separable, Sparse
 from thincam_jax.imaging.refractive_index import ConstantIndex
-from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.camera import SeeThroughCamera, without_dispersion
 from thincam_jax.waveguide.colours import ColourCamera, Crosstalk, colour_system, modelled
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres, trace
 from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import (
+    LitPlane,
     ObjectPlane,
     footprints,
     in_cells,
@@ -41,22 +40,6 @@ _PIXELS, _POOL = 192, (96, 32)
 _MARGIN, _LARGEST, _APART = 1.2, 2.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
 _SHARES = {"orders": 0.4, "crosstalk": 0.6, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
-# Rounding of the sums of a capture.
-_SUMS: dict[Precision, float] = {"float32": 3e-7, "float64": 1e-14}
-
-
-class LitPlane(eqx.Module):
-    """A flat object and the radiances of its cells, for a `ColourCamera` (channel, y, x)."""
-
-    plane: ObjectPlane
-    image: Float[Array, "*channel y x"]
-
-    def __init__(self, plane: ObjectPlane, image: Numbers):
-        self.plane = plane
-        shape = *np.shape(image)[-3:-2], *plane.shape
-        self.image = checks.finite("image", image, "radiance", shape=shape)
-        if not checks.is_traced(self.image) and not np.asarray(self.image).any():
-            raise ValueError("image is dark, and errors are relative to its capture; give light")
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,24 +156,14 @@ def plan(
         raise ValueError(
             f"images are {shapes}; give {(*channels, 'y', 'x')}, of one plane in colours"
         )
-    kind = _ColourProbe if channels else _Probe
     with allow("float64", camera, lit):
-        probe = kind(*cast((camera, lit), "float64"))
+        probe = (_ColourProbe if channels else _Probe)(*cast((camera, lit), "float64"))
         share = 1.0
         while True:
             made = probe.plan(camera, plane, tolerance, share)
             if made.meets_tolerance or share < 0.05:
                 return made
             share /= 2
-
-
-def without_dispersion(camera: SeeThroughCamera) -> SeeThroughCamera:
-    """The camera whose indices are, at every wavelength, those of its middle's colour."""
-    screen = camera.screen
-    wavelength, _ = screen.hologram.bragg_wavelength(jnp.zeros(2, camera.sensor.pitch.dtype))
-    indices = (screen.hologram.index, screen.glass_index)
-    constant = [ConstantIndex(index(wavelength)) for index in indices]
-    return eqx.tree_at(lambda c: (c.screen.hologram.index, c.screen.glass_index), camera, constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +177,7 @@ class _Rays:
 class _Probe:
     """A scene at some pixels: the reference capture, and the errors of other models."""
 
-    rounding: dict[Any, float] = {**_SUMS}
+    rounding: dict[Any, float] = {"float32": 3e-7, "float64": 1e-14}  # of the sums of a capture
     level: Any
 
     def __init__(self, camera: SeeThroughCamera, scene: tuple[LitPlane, ...]):
@@ -396,8 +369,8 @@ class _ColourProbe(_Probe):
         (lit,), self.colours = scene, camera
         middle = camera.cameras[len(camera.cameras) // 2]
         seen = self._draw(middle, [lit.plane] * len(lit.image), lit.image)
-        self.options |= {"smear": _SAMPLES[1:-1], "dispersion": (True,)}
         self.options = {"crosstalk": camera.crosstalk} | self.options
+        self.options |= {"smear": _SAMPLES[1:-1], "dispersion": (True,)}
         counts = min(self.all_orders, _ORDERS[-1]), _SAMPLES[-2]
         seen_from = jnp.asarray(self.pixels[1:]), lit.plane.distance
         found = [camera.trace(*seen_from, out, counts) for out in jnp.arange(len(camera.cameras))]
@@ -417,7 +390,7 @@ class _ColourProbe(_Probe):
             weight = weight.reshape(*weight.shape[:-1], smear, -1).mean(axis=-1) / smear
             ways, channel = np.ogrid[: len(points), :channels]
             for primary in range(primaries):
-                kept = modelled(way["crosstalk"], ways, channel, primary, out) & (channel >= 0)
+                kept = modelled(way["crosstalk"], ways, channel, primary, out)
                 light = weight[:, :, primary] * kept[..., None, None, None]
                 total += np.einsum("wops,wcops->ocp", self._radiance(points, primary), light)
         found = np.asarray(total) / np.asarray(self.level)[:, None]

@@ -121,7 +121,7 @@ def _covered(margin):
     return jnp.where(change > 0, part, (margin > 0).astype(margin.dtype))
 
 
-def equal_parts(light, ends, samples: int):
+def equal_parts(light: Array, ends: Array, samples: int):
     """Means of `ends` in `samples` equal parts of a distribution, (sample, n), and its sum."""
     total = jnp.sum(light)
     share = light / jnp.where(total > 0, total, 1)

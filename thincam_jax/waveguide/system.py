@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
@@ -37,6 +38,20 @@ class ObjectPlane(Module):
     def pitch(self) -> Float[Array, ""]:
         """Of the cells, mm."""
         return self.width / self.shape[1]
+
+
+class LitPlane(eqx.Module):
+    """A flat object and the radiances of its cells, for a `ColourCamera` (channel, y, x)."""
+
+    plane: ObjectPlane
+    image: Float[Array, "*channel y x"]
+
+    def __init__(self, plane: ObjectPlane, image: Numbers):
+        self.plane = plane
+        shape = *np.shape(image)[-3:-2], *plane.shape
+        self.image = checks.finite("image", image, "radiance", shape=shape)
+        if not checks.is_traced(self.image) and not np.asarray(self.image).any():
+            raise ValueError("image is dark, and errors are relative to its capture; give light")
 
 
 @dataclass(frozen=True, eq=False)

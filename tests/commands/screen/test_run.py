@@ -76,7 +76,7 @@ def test_a_file_of_a_full_colour_hologram(tmp_path):
         "methods=[{name: CGM, kind: ridge}]",
         "targets=[{name: face, kind: photograph, image: astronaut}]",
     )
-    with pytest.raises(ConfigError, match="calibration: takes a hologram of one colour"):
+    with pytest.raises(ConfigError, match="calibration.distances: need a hologram of one colour"):
         tiny.experiment(tmp_path, *overrides)
     study = build_screen(tiny.experiment(tmp_path, *overrides, "calibration=null"))
     np.testing.assert_allclose(study.wavelengths[0] / study.wavelengths[1], 630 / 532, rtol=1e-6)
@@ -87,6 +87,21 @@ def test_a_file_of_a_full_colour_hologram(tmp_path):
     assert all(np.ptp(picture.astype(int), axis=-1).max() > 20 for picture in pictures)
     score = stored(tmp_path / "out")["models"]["right"]["methods"]["CGM"]["mean_psnr_db"]
     assert score > 20
+
+
+RESPONSES = "hologram.responses=[{}]".format(
+    ", ".join(f"{{centre: {centre} nm, width: 80 nm}}" for centre in (610, 535, 465))
+)
+
+
+def test_a_file_of_a_colour_sensor(tmp_path):
+    with pytest.raises(ConfigError, match="hologram.responses: are to three colours; give colours"):
+        tiny.experiment(tmp_path, RESPONSES)
+    colours = "hologram.wavelength=null", "hologram.colours=[633 nm, 532 nm, 473 nm]"
+    face = "targets=[{name: face, kind: photograph, image: astronaut}]"
+    config = tiny.experiment(tmp_path, *colours, RESPONSES, face, "calibration.distances=[]")
+    study = build_screen(config)
+    assert study.responses[1].centre == pytest.approx(535e-6) and len(study.responses) == 3
 
 
 def test_the_angle_of_a_file_is_the_tilt_of_the_plate(tmp_path):

@@ -35,20 +35,28 @@ Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 _HOLOGRAM = {"wavelength": None, "object_angle": 0.0, "index": 1.5}
 
 
+class ResponseConfig(section(wg.ColourBand)):
+    """The band of a channel of a colour sensor."""
+
+
 class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
     """Recording of both holograms; angles are in the film, from its normal.
 
     - `colours`: of a full-colour hologram, the wavelengths of red, green and blue in place of
       `wavelength`, recorded one after the other at the same angles.
+    - `responses`: to these of a sensor whose colours have cross-talk; None where it has none.
     """
 
     colours: tuple[Wavelength, Wavelength, Wavelength] | None = None
+    responses: tuple[ResponseConfig, ResponseConfig, ResponseConfig] | None = None
     shrinkage: Annotated[float, Field(gt=-1, lt=1)] = 0.0
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
         if (self.wavelength is None) == (self.colours is None):
             raise FieldError("give it, such as 532 nm, or three colours in its place", "wavelength")
+        if self.responses and not self.colours:
+            raise FieldError("are to three colours; give colours, or drop responses", "responses")
         return self
 
     @property
@@ -69,7 +77,7 @@ class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
 _GLASS = {"glass_index": 1.5}
 
 
-class PlateConfig(section(wg.Screen, only=("glass_thickness", "glass_index"), defaults=_GLASS)):
+class PlateConfig(section(wg.Screen, without=("hologram",), defaults=_GLASS)):
     """The glass plate; a hologram without an outline covers its whole surface.
 
     - `tilt`: against the camera, about x and then about y.
@@ -205,9 +213,9 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
             mistakes, colours = [model.mistake for model in self.models], self.hologram.recorded
             require_mask_fits(mistakes, len(colours), self.band_samples, self.screen.tilt)
         if self.calibration is not None:
-            if self.hologram.colours is not None:
-                message = "takes a hologram of one colour; drop hologram.colours"
-                raise FieldError(message, "calibration")
+            if self.hologram.colours is not None and self.calibration.distances:
+                message = "need a hologram of one colour; drop them or hologram.colours"
+                raise FieldError(message, "calibration", "distances")
             check_cells(self.object.cells, "object", "cells")
             for number, model in enumerate(self.models):
                 if model.name == MEASURED:

@@ -58,6 +58,7 @@ def build_screen(config: ScreenConfig) -> ScreenStudy:
         config.seed,
         config.name,
         build_mask(config),
+        tuple(one.build() for one in config.hologram.responses or ()),
         config,
     )
     try:
