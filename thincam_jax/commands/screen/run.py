@@ -86,15 +86,11 @@ def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
 
 def build_cameras(config: SeeThroughConfig) -> tuple[wg.SeeThroughCamera, ...]:
     """The camera of each colour."""
-    film, plate, cameras = config.hologram, config.screen, []
-    holograms = {"top": plate.top and plate.top.build()}
-    holograms["bottom"] = plate.bottom and plate.bottom.build()
-    others = config.sensor.build(), *config.distances, np.asarray(plate.tilt)
-    for wavelength in film.recorded:
-        hologram = film.build(wavelength=wavelength).processed(film.shrinkage)
-        screen = wg.Screen(hologram, plate.glass_thickness, plate.glass_index, **holograms)
-        cameras.append(wg.SeeThroughCamera(screen, *others))
-    return tuple(cameras)
+    film = config.hologram
+    films = [film.build(wavelength=one).processed(film.shrinkage) for one in film.recorded]
+    screens = [config.screen.build(hologram=one) for one in films]
+    others = config.sensor.build(), *config.distances, np.asarray(config.screen.tilt)
+    return tuple(wg.SeeThroughCamera(screen, *others) for screen in screens)
 
 
 def run_screen(study: ScreenStudy, folder: RunFolder, progress: Progress) -> ScreenResult:
