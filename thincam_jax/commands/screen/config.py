@@ -31,7 +31,6 @@ from thincam_jax.studies.study import check_noise
 
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 
-
 _HOLOGRAM = {"wavelength": None, "object_angle": 0.0, "index": 1.5}
 
 
@@ -74,10 +73,7 @@ class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
         return wg.Rectangle((self.x, self.y), (self.width, self.height))
 
 
-_GLASS = {"glass_index": 1.5}
-
-
-class PlateConfig(section(wg.Screen, without=("hologram",), defaults=_GLASS)):
+class PlateConfig(section(wg.Screen, without=("hologram",), defaults={"glass_index": 1.5})):
     """The glass plate; a hologram without an outline covers its whole surface.
 
     - `tilt`: against the camera, about x and then about y.
