@@ -126,6 +126,7 @@ def measure_matrix(
     counts = calibration.exposure * (2**calibration.bits - 1 - calibration.offset) / brightest
     key = jax.random.fold_in(jax.random.key(study.seed), int(1000 * plane.distance))
     series, cells = calibration.series(plane.shape), math.prod(plane.shape)
+    assert isinstance(system, Sparse)  # of a camera with a lens
     lit = [np.asarray(part) for part in (system.values, system.rows, system.columns)]
     frame = full // system.out_shape[-1], system.out_shape[-1]  # channels one below the other
     measured = []

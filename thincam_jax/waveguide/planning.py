@@ -98,21 +98,21 @@ class Plan:
         ]
         if self.crosstalk is not None:
             lines[-1] = "cross-talk", f"{self.crosstalk}{share['crosstalk']}"
-        width = max(len(name) for name, _ in lines)
-        return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
+        return "\n".join(f"{name:<10}  {text}" for name, text in lines)
 
     def system(self) -> Sparse | Separable:
         """The planned operator, from the cells of the plane or planes to the sensor."""
-        camera = self.camera if self.dispersion else without_dispersion(self.camera)
+        decided: Any = self.camera, self.level, (self.orders, self.samples)
+        camera, level, counts = decided
+        camera = camera if self.dispersion else without_dispersion(camera)
         with allow(self.precision, camera):
             camera, plane = cast((camera, self.plane), self.precision)
-            counts = self.orders, self.samples
             if self.crosstalk is not None:
-                return colour_system(camera, plane, *counts, self.crosstalk, self.level)
+                return colour_system(camera, plane, *counts, self.crosstalk, level)
             if self.field_dependent:
-                return planes_operator(camera, plane, counts, self.level)
+                return planes_operator(camera, plane, counts, level)
             assert isinstance(plane, ObjectPlane)  # several planes are never separated
-            return _separable(camera, plane, float(seen_size(camera, plane)), counts, self.level)
+            return _separable(camera, plane, float(seen_size(camera, plane)), counts, level)
 
 
 def plan(
@@ -286,6 +286,7 @@ class _Probe:
         left, shares, found = tolerance * share / _MARGIN, {}, self.reference.sum(axis=0)
         way: dict[str, Any] = {name: values[-1] for name, values in self.options.items()}
         for name, values in self.options.items():
+            value, size, there = values[-1], math.inf, found
             for value in values:
                 there = self.capture(**(way | {name: value}))
                 size = self._length(there - found) + self.rounding.get(value, 0.0)
@@ -293,7 +294,6 @@ class _Probe:
                     break
             way[name], shares[name], found = value, size, there
             left = max(left - size, 0.0)
-        predicted = self._predicted(found, shares["precision"])
         simpler = self.simpler(way, shares["precision"])
         apart = simpler.get("separable", math.inf)
         apart_serves = len(self.planes) == 1 and apart <= tolerance
@@ -301,7 +301,7 @@ class _Probe:
             camera=camera,
             plane=plane,
             tolerance=tolerance,
-            predicted_error=apart if apart_serves else predicted,
+            predicted_error=apart if apart_serves else self._predicted(found, shares["precision"]),
             orders=way["orders"],
             all_orders=self.all_orders,
             samples=way["smear"],
