@@ -108,7 +108,7 @@ class Plan:
         with allow(self.precision, camera):
             camera, plane = cast((camera, self.plane), self.precision)
             if self.crosstalk is not None:
-                return colour_system(camera, plane, *counts, self.crosstalk, level)
+                return colour_system(camera, plane, counts[0], counts[1], self.crosstalk, level)
             if self.field_dependent:
                 return planes_operator(camera, plane, counts, level)
             assert isinstance(plane, ObjectPlane)  # several planes are never separated
