@@ -30,8 +30,8 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Separable
 from thincam_jax.imaging.targets import middle_square, resize, sample_image, usaf1951
-from thincam_jax.learn.plug_and_play import brightness
 from thincam_jax.learn.refocusing import photographs
+from thincam_jax.reconstruction.problem import brightness
 from thincam_jax.units import deg, nm, um
 
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
@@ -162,9 +162,8 @@ def screen():
         clean = (dense @ small.ravel()).reshape(110, 110)
         capture = noisy(clean, noise, np.random.default_rng(seed))
         # What is known of both: the noise of the capture and of the calibration.
-        variance = float(clean.var()) * 10 ** (-float(noise) / 10) + deviation**2 * float(
-            np.sum(small**2)
-        )
+        variance = float(clean.var()) * 10 ** (-float(noise) / 10)
+        variance += deviation**2 * float(np.sum(small**2))
         seen = reduced.project(matrix, jnp.asarray(capture))
         return tc.Recording(seen, reduced, noise_variance=variance), small
 
@@ -297,16 +296,16 @@ def gain(values):
 
 def report(name, noise, plane, methods):
     """A row: means over the photographs, gains of text and chart, the last two pictures."""
-    tv, pnp = (methods[method].of("PSNR", plane) for method in ("TV", "PnP"))
+    pair = methods["TV"], methods["PnP"]
+    tv, pnp = (one.of("PSNR", plane) for one in pair)
     means = ", ".join(f"{m} {one.of('PSNR', plane)[:-2].mean():.2f}" for m, one in methods.items())
     others = " | ".join(
         f"{measure} " + " / ".join(f"{one.of(measure, plane)[:-2].mean():.3f}" for one in pair)
-        for pair in [[methods["TV"], methods["PnP"]]]
         for measure in MEASURES[1:]
     )
-    times = " / ".join(f"{np.median(methods[method].seconds):.2f}" for method in ("TV", "PnP"))
+    times = " / ".join(f"{np.median(one.seconds):.2f}" for one in pair)
     print(
-        f"{name}, plane {plane} | {noise} | {means} (τ {float(methods['TV'].solver.tau):g}) | "
+        f"{name}, plane {plane} | {noise} | {means} (τ {float(pair[0].solver.tau):g}) | "
         f"{gain((pnp - tv)[:-2])} | text {(pnp - tv)[-2]:+.2f}, chart {(pnp - tv)[-1]:+.2f} | "
         f"{others} | CPU {times}",
         flush=True,

@@ -33,6 +33,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core.precision import as_complex
 from thincam_jax.design.design import Design
 from thincam_jax.design.training import Channel, Training, channels_of, relative_error
+from thincam_jax.reconstruction.problem import brightness
 
 Image = Float[Array, "v u"]
 
@@ -71,7 +72,7 @@ def restore_by(cameras: tuple[Channel, ...], training: Training) -> Float[Array,
         found = captures.linear_estimate()
         if training.denoiser is None:
             return found
-        return captures.plug_and_play(found, training.denoiser, _brightness(image))
+        return captures.plug_and_play(found, training.denoiser, brightness(image))
 
     return jax.vmap(one)(training.images, training.noise)
 
@@ -124,11 +125,6 @@ class _Captures:
             return jnp.where(left <= 2 * tolerance * jnp.linalg.norm(b), found, jnp.nan)
 
         return jax.lax.custom_linear_solve(matrix, right, solve, symmetric=True)
-
-
-def _brightness(image: Image) -> Float[Array, ""]:
-    """Of what is bright in it."""
-    return jnp.sum(image**3) / jnp.sum(image**2)
 
 
 def _prior_root(training: Training) -> Float[Array, "v u"]:

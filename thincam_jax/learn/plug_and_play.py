@@ -40,6 +40,7 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     ScaledProblem,
     back_projected,
+    brightness,
     convolutions,
     detector_shape,
     misfit,
@@ -223,8 +224,8 @@ class _Run:
         self.image = image / self.unit
         level = uniform_image(problem) / self.unit
         seen = brightness(self.image) if warm else jnp.max(level)
-        self.first = or_one(_FIRST * seen) * (_WARM if warm else 1)
-        self.warm, self.largest, self.s, self.sigma = warm, self.first, self.first, self.first
+        self.s = self.largest = or_one(_FIRST * seen) * (_WARM if warm else 1)
+        self.warm = warm
         self.misfit = self.gap = self.change = math.nan
 
     def advance(self, number: int) -> None:
@@ -238,12 +239,10 @@ class _Run:
             begin = _WARM if self.warm else 1.0
             part = (number - 1) / max(solver.iterations - 1, 1)
             self.s = self.largest * begin * (_LAST / begin) ** part
-        s = self.s
-        shift, found = self._data_step(s)
+        shift, found = self._data_step(self.s)
         if not bool(jnp.isfinite(found).all()):
             self.misfit = math.nan
             return
-        self.sigma = s * _SIGMA * solver.strength.astype(s.dtype)
         image = solver.denoiser(found, jnp.broadcast_to(self.sigma, found.shape[:-2]))
         image = jnp.maximum(image, 0) if solver.nonnegative else image
         chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
@@ -254,6 +253,11 @@ class _Run:
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
             self.image, self.result = image, image * self.unit
+
+    @property
+    def sigma(self) -> Float[Array, ""]:
+        """The noise that the denoiser is given."""
+        return self.s * _SIGMA * self.solver.strength.astype(self.s.dtype)
 
     @property
     def is_explained(self) -> bool:
@@ -288,13 +292,6 @@ def _normal(
     ):
         return eqx.tree_at(lambda normal: normal.problem, like, problem)
     return normal_equations(problem, shift)
-
-
-@jax.jit
-def brightness(image: Image) -> Float[Array, ""]:
-    """Brightness of what is bright, Σ f³/Σ f² over f > 0: dark surroundings do not count."""
-    bright = jnp.maximum(image, 0)
-    return jnp.sum(bright**3) / or_one(jnp.sum(bright**2))
 
 
 @eqx.filter_jit

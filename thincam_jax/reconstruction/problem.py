@@ -422,6 +422,13 @@ def or_one(value: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(value > 0, value, 1)
 
 
+@jax.jit
+def brightness(image: Float[Array, "..."]) -> Float[Array, ""]:
+    """Brightness of what is bright, Σ f³/Σ f² over f > 0: dark surroundings do not count."""
+    bright = jnp.maximum(image, 0)
+    return jnp.sum(bright**3) / or_one(jnp.sum(bright**2))
+
+
 def _strength(operator: AbstractOperator) -> Float[Array, ""]:
     """A rough estimate of ‖A‖, which keeps squares within the range of the precision."""
     if isinstance(operator, CropConvolution):
