@@ -46,7 +46,7 @@ def noisy(capture, noise, rng):
     capture = np.asarray(capture, np.float32)
     if noise.endswith("e"):
         gain = float(noise[:-1]) / capture.mean()
-        return rng.poisson(gain * capture).astype(np.float32) / gain
+        return rng.poisson(np.maximum(gain * capture, 0)).astype(np.float32) / gain
     deviation = float(capture.std()) * 10 ** (-float(noise) / 20)
     return capture + np.float32(deviation) * rng.standard_normal(capture.shape, np.float32)
 

@@ -8,7 +8,7 @@ import thincam_jax as tc
 from helpers import compilations, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.learn.plug_and_play import noise_mistake
+from thincam_jax.learn.plug_and_play import largest_noise, noise_mistake
 from thincam_jax.reconstruction.normal_equations import normal_equations
 from thincam_jax.reconstruction.problem import ScaledProblem, back_projected
 
@@ -61,6 +61,25 @@ def test_a_denoiser_is_given_the_largest_noise_of_a_mode():
         inverse = np.linalg.inv(matrix.T @ matrix + np.eye(180) / (2 * sigma) ** 2)
         noise = np.linalg.eigvalsh(inverse @ matrix.T @ matrix @ inverse)
         assert 0.8 * sigma < noise[-1] ** 0.5 <= sigma * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("shift", [0.001, 0.1])
+def test_the_noise_of_convolutions_is_the_largest_of_a_ring_of_frequencies(shift):
+    """Against the spectra of solutions for drawn noise: below s/2 behind a zone aperture."""
+    y, x = np.indices((61, 65)) - np.array([30, 32])[:, None, None]
+    psf = (1 + np.cos(0.05 * (y**2 + x**2))) * (np.hypot(y, x) < 28) / 2500
+    shape = (90, 95)
+    A = CropConvolution(jnp.asarray(psf), 1.0, shape, shape)
+    drawn = np.random.default_rng(1).normal(size=(8, 1, *shape))
+    problem = tc.Recording(jnp.asarray(drawn), A, noise_variance=1.0).problem()
+    normal = normal_equations(problem, jnp.asarray(shift))
+    spectra = np.fft.fft2(normal.solve(back_projected(problem, problem.captures)))
+    power = np.mean(np.abs(spectra) ** 2, axis=(0, 1, 2)) / drawn[0].size
+    radius = np.hypot(*np.meshgrid(*map(np.fft.fftfreq, shape), indexing="ij"))
+    rings = [np.mean(power[np.floor(64 * radius) == k]) for k in range(32)]
+    found = float(largest_noise(normal, normal.shift, jnp.ones(())).item())
+    assert abs(found / max(rings) ** 0.5 - 1) < 0.12
+    assert found < (0.49 if shift < 0.01 else 0.38) / shift**0.5
 
 
 def test_noise_that_was_told_wrongly_is_found():

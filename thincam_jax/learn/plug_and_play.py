@@ -8,8 +8,9 @@ Half-quadratic splitting (Zhang et al., DPIR, IEEE Trans. Pattern Anal. 44, 6360
 with w = 1/variance and a deviation s of the prior that falls from step to step. With
 :math:`M = A^T w A + s^{-2}` the noise of z has the covariance :math:`M^{-1} A^T w A M^{-1}`: a mode
 that the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at
-most s/2, which is σ. A last data step, with s/4, gives back what the denoiser took from modes that
-the captures know well.
+most s/2. σ is the largest of a ring of frequencies, since a denoiser sees a neighbourhood, or s/2
+where the modes are not frequencies. A last data step, with s/4, gives back what the denoiser took
+from modes that the captures know well.
 """
 
 import dataclasses
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.precision import squared_modulus
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
@@ -61,11 +63,13 @@ from thincam_jax.reconstruction.total_variation import TotalVariation
 # s falls from twice the brightness of the image to a 24th of it; given a start, from a twelfth of
 # that. From once the brightness dark images at 20 dB stay 1.5 dB below.
 _FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 12
-# σ/s, the largest noise of a mode: with that of the mean mode, 0.3 to 0.46, noise in a band of
-# frequencies is not removed (methods A and B lose up to 3 dB).
-_SIGMA = 0.5
-# s of the last data step over σ. It gains a FlatCam up to 5 dB.
-_FINAL = 0.5
+# Width of the rings, cycles per pixel. Half of it is s/2 for most cameras; with twice as much, or
+# the mean of all modes, noise in a band is not removed (methods A and B lose up to 3 dB).
+_RING = 1 / 64
+# Of s, since what f has wrong stays in z. Without it two planes lose 0.4 dB at 100 electrons.
+_LEAST_NOISE = 0.4
+# Of s in the last data step. It gains a FlatCam up to 5 dB.
+_FINAL = 0.25
 # Part of its value to which s falls with each further step, and χ² of a pixel that ends them: three
 # times the noise. They halve the residual of bright captures, and gain no more below.
 _FALL, _EXPLAINED = 0.58, 10
@@ -243,7 +247,10 @@ class _Run:
         if not bool(jnp.isfinite(found).all()):
             self.misfit = math.nan
             return
-        image = solver.denoiser(found, jnp.broadcast_to(self.sigma, found.shape[:-2]))
+        sigma = solver.strength.astype(found.dtype) * largest_noise(
+            self.normal, shift, self.precision
+        )
+        image = solver.denoiser(found, jnp.broadcast_to(sigma, found.shape[:-2]))
         image = jnp.maximum(image, 0) if solver.nonnegative else image
         chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
         if number == 0:
@@ -255,18 +262,13 @@ class _Run:
             self.image, self.result = image, image * self.unit
 
     @property
-    def sigma(self) -> Float[Array, ""]:
-        """The noise that the denoiser is given."""
-        return self.s * _SIGMA * self.solver.strength.astype(self.s.dtype)
-
-    @property
     def is_explained(self) -> bool:
         """Whether the image differs from the captures by little more than their noise."""
         return 2 * self.misfit < _EXPLAINED * sum(c.size for c in self.problem.captures)
 
     def finished(self) -> Image:
         """The image after one more data step."""
-        _, image = self._data_step(self.sigma * _FINAL)
+        _, image = self._data_step(self.s * _FINAL)
         image = jnp.maximum(image, 0) if self.solver.nonnegative else image
         return jnp.where(jnp.isfinite(image).all(), image * self.unit, self.result)
 
@@ -274,6 +276,27 @@ class _Run:
         """The shift of the normal equations, and z."""
         shift = 1 / (s**2 * self.precision)
         return shift, _data_step(self.normal, self.right, self.image, shift, self.precision)
+
+
+@eqx.filter_jit
+def largest_noise(
+    normal: AbstractNormal, shift: Float[Array, ""], precision: Float[Array, ""]
+) -> Float[Array, "channel plane"] | Float[Array, ""]:
+    """σ of z: the largest of a ring of frequencies, from 0.4 s; s/2 where modes are other ones."""
+    s, operators = 1 / jnp.sqrt(shift * precision), convolutions(normal.problem)
+    if operators is None or not isinstance(normal, IterativeNormal):
+        return s / 2
+    inverse = dataclasses.replace(normal, shift=shift).inverse_filter(operators)
+    # The diagonal of M⁻¹ AᵀwA M⁻¹ = M⁻¹ − μ M⁻².
+    own = jnp.diagonal(inverse, axis1=1, axis2=2).real
+    power = jnp.moveaxis(own, -1, 1) - shift * jnp.sum(squared_modulus(inverse), axis=2)
+    rows, columns = operators[0].window
+    radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns))
+    ring = np.ravel(radius / _RING).astype(int)
+    sums = jnp.zeros((*power.shape[:2], ring.max() + 1), power.dtype)
+    sums = sums.at[..., ring].add(power.reshape(*power.shape[:2], -1))
+    means = sums / np.bincount(ring).astype(power.dtype)
+    return jnp.maximum(jnp.sqrt(jnp.max(means, axis=-1) / precision), _LEAST_NOISE * s)
 
 
 def _is_slow(problem: InverseProblem) -> bool:

@@ -220,7 +220,7 @@ class IterativeNormal(AbstractNormal):
         options: dict[str, Any] = {"y0": guess / factor}
         operators, filtered = convolutions(self.problem), None
         if operators is not None:
-            filtered = functools.partial(_uncropped, operators[0], self._inverse(operators))
+            filtered = functools.partial(_uncropped, operators[0], self.inverse_filter(operators))
         elif self.modes is not None:
             filtered = functools.partial(_by_modes, self.modes, self.shift)
         if filtered is not None:
@@ -231,8 +231,10 @@ class IterativeNormal(AbstractNormal):
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
-    def _inverse(self, operators: Sequence[CropConvolution]) -> Complex[Array, "channel p q v u"]:
-        """(Σ w̄ ĥ_p* ĥ_q + μ)⁻¹ of the planes p, q at each frequency."""
+    def inverse_filter(
+        self, operators: Sequence[CropConvolution]
+    ) -> Complex[Array, "channel p q v u"]:
+        """(Σ w̄ ĥ_p* ĥ_q + μ)⁻¹ of the planes p, q at each frequency of the window."""
         parts = [
             as_complex(jnp.mean(w)) * o.spectrum[:, :, None].conj() * o.spectrum[:, None]
             for o, w in zip(operators, self.problem.weights, strict=True)
