@@ -213,6 +213,18 @@ def test_too_few_steps_are_told():
 
 
 @pytest.mark.thorough
+def test_single_precision_reaches_a_tolerance_near_its_own():
+    """The residual that conjugate gradients carry along says so before the true one does."""
+    chosen, given = design(), training(SignalNoise(40.0), tolerance=2e-7)
+    arrays, rest = eqx.partition((chosen, given), eqx.is_inexact_array)
+    single = eqx.combine(jax.tree.map(lambda x: x.astype(jnp.float32), arrays), rest)
+    with jax.enable_x64(False):
+        error = end_to_end_error(*single)
+    assert error.dtype == jnp.float32
+    np.testing.assert_allclose(error, compiled_error(chosen, given), rtol=5e-3)
+
+
+@pytest.mark.thorough
 def test_new_values_are_not_traced_again():
     """And a tenth of the light restores less."""
     one, pair = phase_pairs(1), (5.03,)
