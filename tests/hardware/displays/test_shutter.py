@@ -13,6 +13,8 @@ from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.plan import WHITE, scene
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.displays.patterns import pattern_levels
+from thincam_jax.hardware.displays.shutter import Shutter
+from thincam_jax.hardware.virtual.display import VirtualDisplay
 
 
 @pytest.fixture
@@ -65,3 +67,16 @@ def test_nobody_answers(monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     with pytest.raises(NotFound, match="cover the camera: nobody answers at a terminal; begin it"):
         shutter.show(np.zeros((1, 1), np.uint8))
+
+
+def test_before_a_phase_modulator_it_passes_all_but_black_on(monkeypatch):
+    """On which no pattern is dark: a dark frame is one with the camera covered."""
+    shown, asked = [], []
+    monkeypatch.setattr("builtins.input", lambda text: asked.append(text.partition(",")[0]))
+    display = VirtualDisplay((2, 3), shown.append)
+    shutter = Shutter(Shutter.Options(), display)
+    assert shutter.shape == (2, 3) and shutter.identity == display.identity
+    for level in (7, 0, 0, 9):
+        shutter.show(np.full((2, 3), level, np.uint8))
+    assert [levels.max() for levels in shown] == [7, 9]
+    assert asked == ["cover the camera", "uncover the camera"]

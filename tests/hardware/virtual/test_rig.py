@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import time
 
@@ -9,6 +10,7 @@ import scipy
 import thincam_jax as tc
 from helpers import read_fiducial
 from thincam_jax.hardware import CameraSettings, Region, registry
+from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.hardware.errors import NotFound
 from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.display import VirtualDisplay
@@ -19,6 +21,7 @@ from thincam_jax.hardware.virtual.optics import (
     MonitorPose,
     cells_seen,
     cells_shown,
+    pixelated_psf,
 )
 from thincam_jax.hardware.virtual.rig import Electronics, Fiducial, VirtualRig, pattern_number
 from thincam_jax.imaging.operators import Matrix, Sparse
@@ -63,6 +66,61 @@ def test_the_pixels_shown_are_the_mask_of_a_direct_simulation(fill_factor):
 
 def test_a_black_pattern_is_a_dark_frame():
     assert not modulator()(np.zeros((48, 60), np.uint8), 0.0).any()
+
+
+def test_light_behind_phases_and_the_gaps_between_them_by_quadrature():
+    """Pixel averages of |U|² from the Fresnel integral itself, to rounding."""
+    turns, sides = np.random.default_rng(0).random((3, 5)), (3, 5)
+    pitch, fill, gap, wavelength, near, far = 0.036, 0.6, 0.3, 532e-6, 3.0, 40.0
+    grid = tc.Grid((4, 6), 0.05)
+    camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((4, 6), 0.05), near)
+    given = {"pixel_pitch": pitch, "fill_factor": fill, "gap": gap}
+    amplitude = np.exp(2j * np.pi * turns)
+    found = np.asarray(pixelated_psf(amplitude, grid, camera.path(wavelength, far), **given))
+
+    def pieces(count):
+        """Nodes, weights and pixels of the slits and of the gaps between them, -1."""
+        x, w = np.polynomial.legendre.leggauss(40)
+        middle, half = (np.arange(count) - (count - 1) / 2) * pitch, pitch * math.sqrt(fill) / 2
+        ends = np.sort(np.concatenate([middle - half, middle + half]))
+        lower, upper = ends[:-1, None], ends[1:, None]
+        pixel = np.repeat([n // 2 if n % 2 == 0 else -1 for n in range(2 * count - 1)], 40)
+        nodes = (upper + lower) / 2 + (upper - lower) / 2 * x
+        return nodes.ravel(), ((upper - lower) / 2 * w).ravel(), pixel
+
+    (y, wy, v), (x, wx, u) = (pieces(count) for count in sides)
+    inside = (v[:, None] >= 0) & (u >= 0)
+    field = np.where(inside, amplitude[v[:, None], u], gap)
+    field *= np.exp(1j * np.pi / wavelength / far * (y[:, None] ** 2 + x**2)) * wy[:, None] * wx
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+
+    def waves(count, points):
+        at = (((np.arange(count) - (count - 1) / 2)[:, None] + nodes / 2) * 0.05).ravel()
+        return np.exp(1j * np.pi / wavelength / near * (at[:, None] - points) ** 2)
+
+    light = np.abs(waves(4, y) @ field @ waves(6, x).T / (wavelength * near)) ** 2
+    average = np.einsum("aibj,i,j->ab", light.reshape(4, 40, 6, 40), weights, weights) / 4
+    magnified = 1 + near / far
+    np.testing.assert_allclose(found / magnified**2, average, rtol=1e-10)
+
+
+@pytest.mark.thorough
+def test_the_phases_shown_are_the_mask_of_a_direct_simulation():
+    """Of the lit part of the modulator alone, with the light of its gaps."""
+    table = PhaseLevels((0.0, 1.0, 4.0, 5.65), 532 * nm, gap=0.5)
+    lens = tc.LensletArray(focal_length=6.75, pitch=16 * PITCH)
+    levels = table.levels_of(lens, PITCH, 532 * nm)
+    given = {"fill_factor": 0.8, "phases": table, "aperture": levels.shape}
+    optics = dataclasses.replace(modulator(), **given)
+    camera = tc.LenslessCamera(table.mask(levels, PITCH, 532 * nm, 0.8), optics.sensor, 6.75)
+    direct = 1e5 * np.asarray(tc.capture(camera, optics.scene))
+    shown = np.pad(levels, ((16, 16), (22, 22)), constant_values=7)
+    taken = optics(shown, 0.25)
+    modulation = np.linalg.norm(direct - direct.mean())
+    assert np.linalg.norm(taken - direct) < 1e-3 * modulation
+    other = dataclasses.replace(optics, phases=dataclasses.replace(table, gap=0.0))
+    assert np.linalg.norm(other(shown, 0.25) - direct) > 0.02 * modulation
+    assert not optics(np.zeros_like(shown), 0.25).any()  # covered
 
 
 def system(sparse=True):

@@ -54,3 +54,22 @@ def test_whole_numbers_become_real():
     assert tc.SampledMask(np.eye(3, dtype=int), 0.1).amplitude.dtype == jnp.float64
     with pytest.raises(ValueError, match="pitch = 0.0 mm is not positive"):
         tc.SampledMask(VALUES, 0.0)
+
+
+@pytest.mark.parametrize("values", [VALUES, VALUES.T], ids=["wide", "tall"])
+def test_gaps_between_cells_pass_their_own_amplitude(values):
+    """On samples that are whole parts of a cell and of a gap, of amplitude and irradiance."""
+    mask = tc.SampledMask(values, 0.1, fill_factor=0.36, gap=0.25)
+    rows, columns = (5 * n - 2 for n in values.shape)  # the rim's gaps are dark
+    found = np.asarray(sample(mask, tc.Grid((rows, columns), 0.02)))
+    wanted = np.full((rows, columns), 0.25 + 0j)
+    for row, column in np.ndindex(values.shape):
+        wanted[5 * row :, 5 * column :][:3, :3] = values[row, column]
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    shadow = mask.irradiance()
+    grid, pitch = tc.Grid((rows, columns), 0.02), jnp.asarray(0.02)
+    down, across = shadow.rows.samples(grid.y, pitch), shadow.columns.samples(grid.x, pitch)
+    seen = (np.asarray(shadow.coefficients)[:, None] * np.asarray(down)).T @ np.asarray(across)
+    np.testing.assert_allclose(seen, np.abs(wanted) ** 2, atol=1e-12)
+    with pytest.raises(ValueError, match="cells that are open all over have no gap"):
+        tc.SampledMask(values, 0.1, gap=0.25)

@@ -137,7 +137,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     first = run.steps[0]
     frame, facts = run.take(first, settings[first.settings], probe=True)
     run.bits = bits = frame.bit_depth
-    by_hand = isinstance(run.rig.display, Shutter)
+    shown_on = run.rig.display.shape
     attributes = {
         "kind": CAPTURES,
         "sensor_shape": shape,
@@ -150,7 +150,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             "asked": [asdict(one) for one in run.plan.settings],
             "procedure": asdict(run.procedure),
             "start": facts["position"],
-            "display_shape": () if by_hand else run.rig.display.shape,
+            "display_shape": () if shown_on == Shutter.shape else shown_on,
             "versions": versions(),
             "begun": now(),
         },
@@ -224,8 +224,9 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 def _measured(run: Taker) -> tuple[CameraSettings, ...]:
     """Camera settings nearest to the plan's; exposure and settle time measured where asked for."""
     asked, wanted = run.plan.settings, run.procedure
-    measured = wanted.settle is None and not isinstance(run.rig.display, Shutter)
-    if measured:
+    unknown = wanted.settle is None and run.rig.display.shape != Shutter.shape
+    measured = unknown and not isinstance(run.rig.display, Shutter)
+    if unknown:
         run.procedure = replace(wanted, settle=LONGEST)
     lit = next((s for s in run.steps if not s.dark), run.steps[0])
     if wanted.exposure == "auto":

@@ -40,6 +40,7 @@ class Pattern:
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
     - "picture": `name` and SHA-256 `digest` of its levels on `rows` × `columns` cells.
+    - "pixels": the same of levels of so many pixels, such as a phase mask's.
     - "mark": a white disc of the diameter `size` at `x`, `y` from the display's middle, mm.
     - "uniform": `level` of all pixels. "black": no numbers. Other kinds are the renderer's own.
     """
@@ -52,7 +53,7 @@ class Pattern:
         """In a figure's title: β and φ of a mask, the number of a Hadamard frame."""
         if self.kind == "fza":
             return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f} rad"
-        if self.kind == "picture":
+        if self.kind in ("picture", "pixels"):
             return str(self.numbers["name"])
         if self.kind == "uniform":
             return f"level {self.numbers['level']}"
@@ -282,10 +283,18 @@ def pictures(
     """
     shots = []
     for name, levels in shown.items():
-        numbers = {"rows": levels.shape[0], "columns": levels.shape[1]}
-        named = {"name": name, "digest": picture_digest(levels)}
-        shots += [(Pattern("picture", {**named, **numbers}), None)] * frames
+        shots += [(_named("picture", name, levels), None)] * frames
     return _plan("pictures", shots, settings, dark_frames)
+
+
+def pixel_levels(name: str, levels: np.ndarray) -> Pattern:
+    """Levels (row, column), uint8, of the pixels in the middle of a display, for `scene`."""
+    return _named("pixels", name, levels)
+
+
+def _named(kind: str, name: str, levels: np.ndarray) -> Pattern:
+    numbers = {"rows": levels.shape[0], "columns": levels.shape[1]}
+    return Pattern(kind, {"name": name, "digest": picture_digest(levels), **numbers})
 
 
 def grey_levels(settings: CameraSettings, *, frames: int = 1) -> Plan:

@@ -25,6 +25,7 @@ PlanKind = Literal[
     "alignment",
 ]
 MONITOR = "hadamard", "pictures", "alignment"  # plans of a monitor
+SHOWN = "scene", "psf_stack"  # plans of one mask of any kind
 ANYTHING = "scene", "grey_levels"  # plans before which anything may stand
 # What each kind needs, and what it may have beside the dark frames.
 _ZONES = ("betas", "width")
@@ -32,7 +33,7 @@ _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "fringe_scan": (_ZONES, ("profile",)),
     "method_a": ((*_ZONES, "distances"), ("profile",)),
     "method_b": (_ZONES, ("profile",)),
-    "psf_stack": ((*_ZONES, "distances"), ("profile", "phase")),
+    "psf_stack": (("distances",), (*_ZONES, "profile", "phase")),
     "hadamard": (("cells",), ("order", "display")),
     "pictures": (("cells",), (*_ZONES, "profile", "phase", "frames")),
     "scene": ((), (*_ZONES, "profile", "phase", "frames", "exposures")),
@@ -119,14 +120,18 @@ class PlanRequest:
         - `given`: names of the sections that the file has. `pitch`: of its display.
         """
         name, kind = self.kind, f"a plan of kind {self.kind}"
-        optics, matrix, aligned = (key in given for key in ("optics", "matrix", "alignment"))
+        named = "optics", "matrix", "alignment", "mask"
+        optics, matrix, aligned, mask = (key in given for key in named)
         by_cells, pictures = self.by_cells(matrix, optics), name == "pictures"
         moves = name in ("method_a", "psf_stack") and "stage" not in given
         yield moves, f"{kind} moves a stage; give one", "stage"
         unknown = pitch is None and (name != "scene" or simulated)
         yield unknown, f"{kind} is shown on pixels; give it", "display", "pitch"
-        maskless = optics and self.width is None and not by_cells
+        maskless = optics and self.width is None and not by_cells and not mask
         yield maskless, "optics need betas and width of the mask; give them", "plan", "width"
+        yield mask and (name not in SHOWN or not optics), f"{kind} takes none; drop it", "mask"
+        both = mask and (self.betas or self.width)
+        yield both, "the file has a 'mask' in their place; drop them", "plan", "betas"
         unfit = by_cells == optics and (by_cells or simulated or name not in ANYTHING)
         yield unfit, f"{kind} {'takes no' if by_cells else 'needs'} optics", "optics"
         yield pictures and not (optics or matrix), f"{kind} needs it", "matrix"
@@ -152,11 +157,13 @@ class PlanRequest:
         *,
         stage_zero: float = 0.0,
         shown: Mapping[str, np.ndarray] | None = None,
+        mask: plans.Pattern = plans.WHITE,
     ) -> plans.Plan:
         """The steps.
 
         - `stage_zero`: distance at the stage's position 0, mm.
         - `shown`: levels of the pictures on the cells, uint8, by name.
+        - `mask`: where there are no `betas`.
         """
         dark = {"dark_frames": self.dark_frames}
         if self.kind == "alignment":
@@ -169,7 +176,6 @@ class PlanRequest:
             return plans.pictures(shown or {}, settings, frames=self.frames, **dark)
         if self.kind == "grey_levels":
             return plans.grey_levels(settings, frames=self.frames)
-        mask = plans.WHITE
         if self.betas:
             form = {"phase": self.phase, "profile": self.profile}
             mask = plans.zone_plate(self.betas[0], self.width or 0.0, **form)

@@ -75,13 +75,17 @@ def open_rig(
     pitch: float,
     virtual: "VirtualRig | None" = None,
     pictures: Mapping[str, np.ndarray] | None = None,
+    *,
+    turns_phase: bool = False,
 ) -> Iterator[Rig]:
     """Open the devices of a rig and home its stage; a context manager.
 
     - `drivers`: name and options of the driver of the camera, the display and, if any, the stage.
     - `pitch`: of the display's pixels, mm, for which zone plates are drawn.
     - `virtual`: simulated optics, whose virtual devices are opened in place of real ones.
-    - `pictures`: those of a plan of pictures, by name.
+    - `pictures`: those of a plan of pictures or pixels, by name.
+    - `turns_phase`: the display is a phase modulator, which shows no black: someone covers the
+      camera for dark frames.
 
     **Errors**: Busy for a device that another process holds; those of the drivers; ValueError for
     unknown options.
@@ -99,12 +103,15 @@ def open_rig(
                 if name != "shutter":
                     chosen = ", ".join(f"{key}: {value}" for key, value in options.items())
                     stack.enter_context(held(f"{name} {{{chosen}}}" if chosen else name))
+            if turns_phase:
+                shown = openers["display"]
+                openers["display"] = lambda: Shutter(Shutter.Options(), shown())
         else:
             devices = stack.enter_context(VirtualDevices(virtual))
             openers = {role: partial(getattr(devices, role), *drivers[role]) for role in drivers}
 
         def render(pattern: Pattern) -> np.ndarray:
-            if isinstance(rig.display, Shutter):
+            if rig.display.shape == Shutter.shape:
                 pattern = BLACK if pattern == BLACK else WHITE
             return pattern_levels(pattern, rig.display.shape, pitch, pictures)
 

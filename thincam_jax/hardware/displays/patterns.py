@@ -26,17 +26,17 @@ def pattern_levels(
 ) -> np.ndarray:
     """Levels of a pattern of a plan on a display of a shape and a pixel pitch, mm.
 
-    - `pictures`: by name, levels of cells (row, column), as the plan was made with.
+    - `pictures`: by name, levels of cells or pixels (row, column), as the plan was made with.
 
     **Errors**: as of `mask_pattern` and `on_cells`; ValueError for a pattern of another kind, and a
     picture that is not the one of the plan.
     """
     numbers: dict[str, Any] = dict(pattern.numbers)
-    if pattern.kind == "picture":
+    if pattern.kind in ("picture", "pixels"):
         levels = (pictures or {}).get(numbers["name"])
         if levels is None or picture_digest(levels) != numbers["digest"]:
             raise ValueError(f"the picture {numbers['name']!r} is not the one of the plan")
-        return on_cells(levels, shape)
+        return on_cells(levels, shape, 1 if pattern.kind == "pixels" else None)
     if pattern.kind in ("black", "uniform"):
         return np.full(shape, numbers.get("level", 0), np.uint8)
     if pattern.kind == "hadamard":
@@ -109,13 +109,16 @@ def mask_pattern(
     return np.rint(255 * np.clip(amplitude, 0.0, 1.0) ** 2).astype(np.uint8)
 
 
-def on_cells(levels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Levels of cells (row, column), centred on the display, with the largest cells that fit.
+def on_cells(levels: np.ndarray, shape: tuple[int, int], side: int | None = None) -> np.ndarray:
+    """Levels of cells (row, column), centred on the display.
+
+    `side`: of a cell in pixels; None: the largest that fits.
 
     **Errors**: ValueError where a cell would be smaller than a pixel.
     """
-    size = min(shape[axis] // levels.shape[axis] for axis in (0, 1))
-    if size < 1:
+    most = min(shape[axis] // levels.shape[axis] for axis in (0, 1))
+    size = side or most
+    if most < size or size < 1:
         raise ValueError(
             f"{levels.shape[0]} × {levels.shape[1]} cells do not fit into {shape[0]} × {shape[1]} "
             "pixels; give fewer cells"

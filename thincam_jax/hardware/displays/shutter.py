@@ -12,6 +12,8 @@ class Shutter(Display):
     """For a camera before which nothing is shown: a black pattern asks to cover it, by hand.
 
     A pattern is one level. The camera is taken for open at first, except after `forget`.
+
+    - `display`: a phase modulator, on which no pattern is dark, and which shows the others.
     """
 
     shape = (1, 1)
@@ -21,8 +23,11 @@ class Shutter(Display):
     class Options:
         """None."""
 
-    def __init__(self, options: Options):
+    def __init__(self, options: Options, display: Display | None = None):
         self._is_open: bool | None = True
+        self._display = display
+        if display is not None:
+            self.shape, self.identity = display.shape, display.identity
 
     def forget(self) -> None:
         """Ask at the next pattern, whichever it is: an earlier run may have left a cover."""
@@ -40,6 +45,9 @@ class Shutter(Display):
                     "begin it in one, or set dark_frames to 0"
                 ) from error  # fmt: skip
         self._is_open = wanted
+        if wanted and self._display is not None:
+            self._display.show(pattern)
 
     def close(self) -> None:
-        pass
+        if self._display is not None:
+            self._display.close()

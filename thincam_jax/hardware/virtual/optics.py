@@ -7,6 +7,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 import skimage
 from jaxtyping import Array, Complex, Float, UInt8
 from numpy.polynomial.legendre import leggauss
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from thincam_jax._core.grids import Grid, block_mean, centred_indices
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import check_fields, quantity
+from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse, kernel_grid
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.imaging.scene import Scene
@@ -30,6 +32,7 @@ from thincam_jax.measured.calibration.alignment import to_indices
 
 _TERMS = 4  # singular terms of a pattern that are averaged exactly
 _POINTS = 4  # along a pixel, for the remainder
+_LITTLE = 0.02  # of the amplitude, a remainder for which these are enough
 _FINE = 4  # samples of a monitor along a cell
 
 
@@ -49,13 +52,16 @@ class Optics(Protocol):
 class ModulatorOptics:
     """A scene through a light modulator, whose pixels are the mask, on a sensor on a stage.
 
-    A pixel of level g transmits g/255 of the irradiance, the amplitude √(g/255); the PSF of the
-    pixels is `pixelated_psf`.
+    A pixel of level g transmits g/255 of the irradiance, the amplitude √(g/255), or turns the phase
+    by the table `phases`, of which no light is left where all levels are 0: the camera is covered.
+    The PSF of the pixels is `pixelated_psf`.
 
     - `pixel_pitch`: of the modulator, mm; its middle is on the axis.
     - `distance`: from modulator to sensor, mm, at the stage's position 0.
     - `electrons`: per second and pixel for each mm² of open aperture before a white scene.
     - `fill_factor`: open fraction of a modulator pixel's area.
+    - `phases`: of a phase modulator's levels, and its dead space.
+    - `aperture`: rows and columns in the middle of a phase modulator that are lit; None: all.
     """
 
     scene: Scene
@@ -64,6 +70,8 @@ class ModulatorOptics:
     distance: float
     electrons: float
     fill_factor: float = 1.0
+    phases: PhaseLevels | None = None
+    aperture: tuple[int, int] | None = None
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
@@ -73,11 +81,11 @@ class ModulatorOptics:
         self, shown: UInt8[np.ndarray, "v u"], position: float
     ) -> Float[np.ndarray, "y x"]:
         image = np.zeros(self.sensor.shape, np.float32)
-        pixels = np.sqrt(_middle(shown) / 255)
-        if not pixels.any():
+        if not shown.any():
             return image
+        shown = _middle(shown) if self.phases is None else _cropped(shown, self.aperture)
         # Only the size of this mask is used; its transmittances act in the PSF.
-        mask = SampledMask(pixels, self.pixel_pitch)
+        mask = SampledMask(shown, self.pixel_pitch)
         camera = LenslessCamera(mask, self.sensor, self.distance + position)
         grid, spectrum = self.sensor.grid, self.scene.spectrum
         for plane in self.scene.planes:
@@ -85,11 +93,12 @@ class ModulatorOptics:
             kernels = [
                 weight
                 * pixelated_psf(
-                    pixels,
+                    self._amplitude(shown, float(wavelength)),
                     kernel_grid(grid, shape),
                     camera.path(wavelength, plane.distance),
                     pixel_pitch=self.pixel_pitch,
                     fill_factor=self.fill_factor,
+                    gap=0.0 if self.phases is None else self.phases.gap,
                 )
                 for wavelength, weight in zip(spectrum.wavelengths, spectrum.weights, strict=True)
             ]
@@ -97,6 +106,17 @@ class ModulatorOptics:
             convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)
             image = image + np.asarray(convolution(project(camera, plane, shape)))
         return (self.electrons * image).astype(np.float32)
+
+    def _amplitude(self, shown: np.ndarray, wavelength: float) -> np.ndarray:
+        if self.phases is None:
+            return np.sqrt(shown / 255)
+        return np.exp(1j * self.phases.at(wavelength))[shown]
+
+
+def _cropped(shown: np.ndarray, shape: tuple[int, int] | None) -> np.ndarray:
+    rows, columns = shape or shown.shape
+    top, left = (shown.shape[0] - rows) // 2, (shown.shape[1] - columns) // 2
+    return shown[top : top + rows, left : left + columns]
 
 
 def _middle(shown: np.ndarray) -> np.ndarray:
@@ -110,12 +130,13 @@ def _middle(shown: np.ndarray) -> np.ndarray:
 
 
 def pixelated_psf(
-    amplitude: Float[np.ndarray, "v u"],
+    amplitude: Float[np.ndarray, "v u"] | Complex[np.ndarray, "v u"],
     grid: Grid,
     path: Path,
     *,
     pixel_pitch: float,
     fill_factor: float = 1.0,
+    gap: float = 0.0,
 ) -> Float[Array, "y x"]:
     r"""Pixel averages of the PSF of a display of square pixels with given amplitudes.
 
@@ -126,29 +147,35 @@ def pixelated_psf(
     approximation. By singular value decomposition of A the field is a sum of separable terms, three
     for a grey Fresnel zone aperture, and so is the irradiance of the largest ones, whose pixel
     averages are one-dimensional. The remainder, such as the rounding to 8 bits, is averaged over a
-    few points of each pixel.
+    few points of each pixel; where it is more, as of phases, over as many as its fringes need.
+
+    `gap`: amplitude between the open parts, that of a slit over all pixels less these.
     """
-    left, strength, right = np.linalg.svd(amplitude, full_matrices=False)
-    down, across = left[:, :_TERMS] * strength[:_TERMS], right[:_TERMS].T
     dtype = grid.pitch.dtype
     mask = SampledMask(amplitude, pixel_pitch)
+    amplitude = scipy.linalg.block_diag(amplitude - gap, gap)  # of the pixels and of the whole
+    left, strength, right = np.linalg.svd(amplitude, full_matrices=False)
+    down, across = left[:, :_TERMS] * strength[:_TERMS], right[:_TERMS].T
     nodes = pixel_nodes(mask, grid, path, "float64" if dtype == jnp.float64 else "float32")
-    places = np.concatenate([leggauss(nodes)[0], leggauss(_POINTS)[0]]) / 2
+    little = np.linalg.norm(strength[_TERMS:]) < _LITTLE * np.linalg.norm(strength)
+    points = _POINTS if little else nodes
+    places = np.concatenate([leggauss(nodes)[0], leggauss(points)[0]]) / 2
     offsets = grid.pitch * jnp.asarray(places, dtype)[:, None]
     slit = jnp.asarray(pixel_pitch, dtype), jnp.asarray(fill_factor, dtype)
     x = jnp.concatenate([grid.y + offsets, grid.x + offsets], axis=1)
     if down.shape[0] == across.shape[0]:  # both at once: half as much to compile
-        fields = _slit_fields(x, len(down), slit, path)
+        fields = _slit_fields(x, len(down) - 1, slit, path)
         along = fields[:, : grid.shape[0]], fields[:, grid.shape[0] :]
     else:
         rows, columns = x[:, : grid.shape[0]], x[:, grid.shape[0] :]
         along = (
-            _slit_fields(rows, len(down), slit, path),
-            _slit_fields(columns, len(across), slit, path),
+            _slit_fields(rows, len(down) - 1, slit, path),
+            _slit_fields(columns, len(across) - 1, slit, path),
         )
-    terms = jnp.asarray(down, dtype), jnp.asarray(across, dtype)
-    rest = jnp.asarray(amplitude - down @ across.T, dtype)
-    return _averaged(along, terms, rest, grid)
+    waves = np.result_type(dtype, np.complex64)
+    terms = jnp.asarray(down, waves), jnp.asarray(across, waves)
+    rest = jnp.asarray(amplitude - down @ across.T, waves)
+    return _averaged(along, terms, rest, grid, points)
 
 
 @functools.partial(jax.jit, static_argnames="count")
@@ -158,7 +185,7 @@ def _slit_fields(
     slit: tuple[Float[Array, ""], Float[Array, ""]],
     path: Path,
 ) -> Complex[Array, "node n cell"]:
-    """One-dimensional field at x behind each of the display's open pixels.
+    """One-dimensional field at x behind each of the display's open pixels, and behind all of it.
 
     `slit`: the display's pitch and fill factor.
     """
@@ -166,35 +193,37 @@ def _slit_fields(
     sites = centred_indices(count, x.dtype) * slit[0]
     half = slit[0] * jnp.sqrt(slit[1]) / 2
     at = x[..., None] / scale
-    cells = chirp_integral(jnp.zeros_like(b), b, at, sites - half, sites + half)
+    ends = jnp.append(sites - half, sites[0] - half), jnp.append(sites + half, sites[-1] + half)
+    cells = chirp_integral(jnp.zeros_like(b), b, at, *ends)
     return cells * as_complex(jnp.sqrt(scale / (path.wavelength * path.distance)))
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="points")
 def _averaged(
     along: tuple[Complex[Array, "node y v"], Complex[Array, "node x u"]],
-    terms: tuple[Float[Array, "v term"], Float[Array, "u term"]],
-    rest: Float[Array, "v u"],
+    terms: tuple[Complex[Array, "v term"], Complex[Array, "u term"]],
+    rest: Complex[Array, "v u"],
     grid: Grid,
+    points: int,
 ) -> Float[Array, "y x"]:
     """`along`: the slits' fields at the nodes of the exact averages, then of the remainder."""
-    nodes = len(along[0]) - _POINTS
+    nodes = len(along[0]) - points
     lower, upper = np.triu_indices(terms[0].shape[1])
-    shares, few = (jnp.asarray(leggauss(n)[1] / 2, grid.pitch.dtype) for n in (nodes, _POINTS))
+    shares, few = (jnp.asarray(leggauss(n)[1] / 2, grid.pitch.dtype) for n in (nodes, points))
 
     def pairs(fields, profiles):
         """Averages of F_r conj(F_s), r ≤ s, of the terms' one-dimensional fields."""
-        one = product(fields[:nodes], as_complex(profiles))
+        one = product(fields[:nodes], profiles)
         products = one[..., lower] * jnp.conj(one[..., upper])
         return jnp.tensordot(as_complex(shares), products, axes=1, precision="highest").T
 
     rows, columns = (pairs(f, p) for f, p in zip(along, terms, strict=True))
     weights = as_complex(jnp.asarray(np.where(lower == upper, 1.0, 2.0), grid.pitch.dtype))
     largest = SeparableSum(weights[:, None] * rows, columns, grid).image()
-    down, across = (as_complex(profiles) for profiles in terms)
+    down, across = terms
 
     def add_row(total, node):
-        main, other = product(node[0], down), product(node[0], as_complex(rest))
+        main, other = product(node[0], down), product(node[0], rest)
 
         def add(total, inner):
             field = product(main, product(inner[0], across).T)

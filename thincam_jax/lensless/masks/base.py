@@ -124,13 +124,20 @@ class AxisFactors(Module):
 
 
 def open_parts(
-    values: Complex[Array, "term cell"], pitch: Float[Array, ""], fill_factor: Float[Array, ""]
+    values: Complex[Array, "term cell"],
+    pitch: Float[Array, ""],
+    fill_factor: Float[Array, ""],
+    gaps: Complex[Array, "term 1"] | None = None,
 ) -> AxisFactors:
-    """Cells `pitch` apart about the mask's centre, open in their middle √fill_factor, else dark."""
+    """Cells `pitch` apart about the mask's centre, open in their middle √fill_factor.
+
+    `gaps`: each factor's value between the cells; None for dark ones.
+    """
     centres = centred_indices(values.shape[1], pitch.dtype) * pitch
     half = pitch * jnp.sqrt(fill_factor) / 2
     edges = jnp.stack([centres - half, centres + half], axis=-1).ravel()
-    with_gaps = jnp.stack([values, jnp.zeros_like(values)], axis=-1)
+    between = jnp.zeros_like(values) if gaps is None else jnp.broadcast_to(gaps, values.shape)
+    with_gaps = jnp.stack([values, between], axis=-1)
     return AxisFactors(edges, with_gaps.reshape(len(values), -1)[:, :-1])
 
 

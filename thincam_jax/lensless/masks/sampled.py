@@ -50,6 +50,7 @@ class SampledMask(AbstractFactoredMask):
     - `pitch`: side of a cell, mm.
     - `centre`: (y, x) of the mask's centre, mm.
     - `fill_factor`: part of a cell's area that is open, in its middle; None for all of it.
+    - `gap`: amplitude transmittance between the open parts; None where it is dark.
 
     ```python
     import thincam_jax as tc
@@ -71,6 +72,13 @@ class SampledMask(AbstractFactoredMask):
     fill_factor: Float[Array, ""] | None = eqx.field(
         default=None, converter=quantity(check=checks.fraction, optional=True), kw_only=True
     )
+    gap: Float[Array, ""] | None = eqx.field(
+        default=None, converter=quantity(least=0.0, most=1.0, optional=True), kw_only=True
+    )
+
+    def __check_init__(self):
+        if self.gap is not None and self.fill_factor is None:
+            raise ValueError("cells that are open all over have no gap: give a fill_factor, too")
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -78,9 +86,14 @@ class SampledMask(AbstractFactoredMask):
         return rows * self.pitch, columns * self.pitch
 
     @property
-    def finest_frequency(self) -> float:
-        """Beyond which, along either axis, half of the modulation |t|² − mean lies, cycles/mm."""
+    def finest_frequency(self) -> float | None:
+        """Beyond which, along either axis, half of the modulation |t|² − mean lies, cycles/mm.
+
+        None of phases alone.
+        """
         shadow = np.abs(np.asarray(self.amplitude)) ** 2
+        if jnp.iscomplexobj(self.amplitude) and np.ptp(shadow) < 1e-5 * shadow.max():
+            return None
         power = np.abs(np.fft.rfft2(shadow - shadow.mean())) ** 2
         power[:, 1 : (shadow.shape[1] + 1) // 2] *= 2  # the columns that are left out
         down, across = np.fft.fftfreq(shadow.shape[0]), np.fft.rfftfreq(shadow.shape[1])
@@ -91,29 +104,41 @@ class SampledMask(AbstractFactoredMask):
         return float(frequency[order[place]] / np.asarray(self.pitch))
 
     def terms(self, wavelength: Number | None = None) -> MaskTerms:
-        return self._terms(self.amplitude)
+        return self._terms(self.amplitude, self.gap)
 
     def irradiance(self, wavelength: Number | None = None) -> MaskTerms:
-        return self._terms(jnp.abs(self.amplitude) ** 2)
+        gap = None if self.gap is None else self.gap**2
+        return self._terms(jnp.abs(self.amplitude) ** 2, gap)
 
-    def _terms(self, values) -> MaskTerms:
-        """A term for each row of the values, or for each column."""
+    def _terms(self, values, gap) -> MaskTerms:
+        """A term for each row of the values, or for each column; one of the whole, with a gap."""
         rows, columns = values.shape
         values = values if jnp.iscomplexobj(values) else as_complex(values)
         each = jnp.eye(min(rows, columns), dtype=values.dtype)
+        if gap is not None:
+            values = values - as_complex(gap)
         down, across = (each, values) if rows <= columns else (values.T, each)
-        return MaskTerms(jnp.ones_like(each[0]), self._factors(down), self._factors(across))
+        weights = jnp.ones_like(each[0])
+        if gap is not None:
+            weights = jnp.append(weights, as_complex(gap))
+        return MaskTerms(weights, self._factors(down), self._factors(across))
 
     def _factors(self, values: Complex[Array, "term cell"]) -> AxisFactors:
         if self.fill_factor is None:
             return AxisFactors(cell_edges(values.shape[1], self.pitch), values)
-        return open_parts(values, self.pitch, self.fill_factor)
+        if self.gap is None:
+            return open_parts(values, self.pitch, self.fill_factor)
+        whole = jnp.zeros_like(values[:, :1]), jnp.ones_like(values[:1, :1])
+        values = jnp.concatenate([values, jnp.ones_like(values[:1])])
+        return open_parts(values, self.pitch, self.fill_factor, jnp.concatenate(whole))
 
     def sample(self, grid: Grid, wavelength: Number | None = None) -> Transmittance:
         rows, columns = self.amplitude.shape
         dtype = self.amplitude.dtype
         down = self._coverage(grid.y - self.centre[0], grid.pitch, rows).astype(dtype)
         across = self._coverage(grid.x - self.centre[1], grid.pitch, columns).astype(dtype)
+        if self.gap is not None:
+            return super().sample(grid, wavelength)
         return product(product(down, self.amplitude), across.T)
 
     def _coverage(self, x, pitch, cells: int) -> Float[Array, "n cell"]:

@@ -1,0 +1,105 @@
+r"""Phases of a phase-only light modulator (LCoS) by its levels, and the levels of a phase mask."""
+
+import json
+from dataclasses import asdict, dataclass
+from os import PathLike
+from typing import Annotated
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from thincam_jax._core import checks
+from thincam_jax._core.files import read_regular, write_whole
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.quantity import check_fields, quantity
+from thincam_jax.hardware.displays.grey_levels import LEVELS
+from thincam_jax.lensless.masks import AbstractMask, SampledMask
+
+_TURN = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class PhaseLevels:
+    """Measured phases of a modulator's levels, at a wavelength.
+
+    - `phases`: rad, of levels in equal steps from 0 to 255: of all 256, or of fewer, between which
+      they are interpolated linearly.
+    - `wavelength`: at which they were measured, mm.
+    - `tolerance`: width of the interval about a phase in which a level has to lie, rad.
+    - `gap`: amplitude of the light of the dead space between pixels, which keeps the phase 0, over
+      that of a pixel: part of the zero order.
+    """
+
+    phases: Annotated[tuple[float, ...], quantity("rad", many=True)]
+    wavelength: Annotated[float, quantity("mm", check=checks.wavelength)]
+    tolerance: Annotated[float, quantity("rad", positive=True)] = np.pi / 4
+    gap: Annotated[float, quantity(least=0.0, most=1.0)] = 0.0
+
+    def __post_init__(self):
+        check_fields(self)
+        if not 2 <= len(self.phases) <= LEVELS:
+            raise ValueError(f"{len(self.phases)} phases; give 2 to {LEVELS}, from level 0 to 255")
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write the table as a JSON file."""
+        write_whole(path, json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def read(cls, path: str | PathLike[str]) -> "PhaseLevels":
+        """Read the table of a file; ValueError, one line, for an invalid one."""
+        try:
+            content = json.loads(read_regular(path))
+            return cls(**{**content, "phases": tuple(content["phases"])})
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} holds no table of phases: {error}") from error
+
+    def at(self, wavelength: float) -> np.ndarray:
+        """Phase of each of the 256 levels at a wavelength, mm, by λ₀/λ: without dispersion."""
+        steps = np.linspace(0, LEVELS - 1, len(self.phases))
+        table = np.interp(np.arange(LEVELS), steps, self.phases)
+        return table * (self.wavelength / wavelength)
+
+    def levels(self, phase: np.ndarray, wavelength: float) -> np.ndarray:
+        """Levels (y, x), uint8, whose phases at a wavelength, mm, are nearest to given ones, rad.
+
+        Whole turns do not count.
+
+        **Errors**: ValueError where no level is within half the tolerance of a phase.
+        """
+        table = self.at(wavelength)
+        apart, levels = KDTree(_on_circle(table)).query(_on_circle(phase))
+        error, allowed = 2 * np.arcsin(np.minimum(np.max(apart) / 2, 1)), self.tolerance / 2
+        if error > allowed:
+            worst = np.mod(phase.ravel()[np.argmax(apart)], _TURN)
+            raise ValueError(
+                f"the phase {worst:.3g} rad is {error:.2g} rad from the nearest level, of which "
+                f"the modulator has {table.min():.3g} to {table.max():.3g} rad, and {allowed:.2g} "
+                f"are allowed; give a tolerance of {2 * error + 5e-3:.2f} rad, or a mask of less"
+            )
+        return levels.astype(np.uint8)
+
+    def levels_of(self, mask: AbstractMask, pitch: float, wavelength: float) -> np.ndarray:
+        """Levels of a mask that turns the phase, on pixels of a pitch, mm.
+
+        **Errors**: as of `levels`; ValueError for sides that are no whole number of pixels.
+        """
+        sides = zip(("height", "width"), mask.extent, strict=True)
+        rows, columns = (checks.whole_cells(name, side, "pitch", pitch) for name, side in sides)
+        phase = np.angle(np.asarray(mask.sample(Grid((rows, columns), pitch), wavelength)))
+        if not phase.any():
+            raise ValueError("it turns no phase; give lenslets, a relief or a phase of a file")
+        return self.levels(phase, wavelength)
+
+    def mask(
+        self, levels: np.ndarray, pitch: float, wavelength: float, fill_factor: float = 1.0
+    ) -> SampledMask:
+        """What levels (y, x) are at a wavelength: the mask of a camera's model.
+
+        - `pitch`: of the pixels, mm. `fill_factor`: of a pixel's area, which turns the phase.
+        """
+        amplitude = np.exp(1j * self.at(wavelength))[levels]
+        return SampledMask(amplitude, pitch, fill_factor=fill_factor, gap=self.gap)
+
+
+def _on_circle(phase: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
