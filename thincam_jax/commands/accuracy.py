@@ -1,8 +1,5 @@
 """The benchmark of accuracy: errors and times of all models, and what an error costs."""
 
-from dataclasses import asdict
-from typing import Any
-
 from thincam_jax._core import checks
 from thincam_jax._core.environment import machine
 from thincam_jax._core.steps import Progress, Step, carry_out
@@ -11,7 +8,6 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.commands.sections import SensorConfig, StudyConfig
 from thincam_jax.commands.study.build import build_study, check_optics
-from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.evaluate import check_target
 from thincam_jax.studies.psf_error_cost import AccuracyResult, AccuracyRun, make_case
 
@@ -62,34 +58,7 @@ def check(
 def run_accuracy(plan: AccuracyRun, folder: BenchFolder, progress: Progress) -> AccuracyResult:
     """Run the benchmark into a folder."""
     folder.claim(plan.study.config)
-    last = Step("results", lambda: folder.write(folder.result, to_json(_record(plan))))
-    carry_out([*plan.work, last], progress)
+    head = {"bench": "accuracy", "config": dump_config(plan.study.config), "machine": machine()}
+    write = lambda: folder.write(folder.result, to_json(head | plan.record()))  # noqa: E731
+    carry_out([*plan.work, Step("results", write)], progress)
     return plan.result
-
-
-def _record(plan: AccuracyRun) -> dict[str, Any]:
-    config, found = plan.study.config, asdict(plan.result)
-    costs = found["reconstructions"]
-    for rows in (found["captures"], costs["models"], costs["controlled"]):
-        for row in rows:  # without the figures of one that was not run
-            for key in [key for key, value in row.items() if value is None and key != "reason"]:
-                del row[key]
-    settings = {
-        "study": config.name,
-        "reference": "separable, float64",
-        "sizes": list(plan.sizes),
-        "camera": _numbers(plan.study.exposures[0]),
-        "object_distance_mm": config.object.distance,
-        "pixel_integration": config.pixel_integration,
-        "capture_shape": list(plan.case.study.sensor.shape),
-        "target": plan.case.target.name,
-        "captured": _numbers(plan.case.method.exposures[0]),
-    }
-    head = {"bench": "accuracy", "config": dump_config(config), "settings": settings}
-    return head | {"machine": machine()} | found
-
-
-def _numbers(exposure: Exposure) -> dict[str, Any]:
-    names = "beta_rad_per_mm2", "phase_rad", "distance_mm", "wavelength_mm"
-    numbers = exposure.beta, exposure.phase, exposure.distance, exposure.wavelength
-    return dict(zip(names, numbers, strict=True))

@@ -52,14 +52,8 @@ KINDS = {
         *("refocus:build_refocus", "refocus:run_refocus"),
     ),
     "screen": Kind(
-        *(
-            "a see-through screen",
-            "run",
-            "screen.config:ScreenConfig",
-            "explain:rays",
-            "sts_camera",
-        ),
-        *("screen.run:build_screen", "screen.run:run_screen"),
+        *("a see-through screen", "run", "screen.config:ScreenConfig", "explain:rays"),
+        *("sts_camera", "screen.run:build_screen", "screen.run:run_screen"),
     ),
     "design": Kind(
         *("a design", "design", "design.config:DesignConfig", "explain:search", "design_distances")

@@ -4,12 +4,15 @@ import inspect
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
 import pydantic
+from numpy.lib.format import open_memmap
 from pydantic import Field
 
 from thincam_jax._core import checks
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import Length, section
+from thincam_jax.imaging.targets import load_image
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.masks.cells import Combination
@@ -31,7 +34,7 @@ class ApertureConfig(section(masks.FresnelZoneAperture, only=APERTURE)):
 _WIDEST = 300.0  # mask of a thin camera, mm
 Relief = Literal["diffuser", "voronoi_fresnel", "contours"]
 Cells = Literal["mura", "ura", "mls", "random"]
-Family = Literal["fza", Cells, "pinhole", "lenslets", "file", Relief]
+Family = Literal["fza", Cells, "pinhole", "lenslets", "file", "phase", Relief]
 
 
 def _sequences(length: int, cell: float, combine: Combination = "xor") -> masks.SeparableMask:
@@ -46,6 +49,11 @@ def _lenslets(focal_length: float, cell: float, lenses: tuple[int, int]) -> mask
 def _image(path: str, width: float) -> masks.SampledMask:
     amplitude = masks.read_mask(path, 1.0).amplitude
     return masks.SampledMask(amplitude, width / amplitude.shape[1])
+
+
+def _phases(path: str, width: float) -> masks.SampledMask:
+    phase = open_memmap(path, "r") if path.endswith(".npy") else 2 * np.pi * load_image(path)
+    return masks.SampledMask(np.exp(1j * phase), width / phase.shape[-1])
 
 
 def _contours(
@@ -66,6 +74,7 @@ FAMILIES: dict[Family, Callable[..., masks.AbstractMask]] = {
     "pinhole": masks.Pinhole,
     "lenslets": _lenslets,
     "file": _image,
+    "phase": _phases,
     "diffuser": masks.diffuser,
     "voronoi_fresnel": masks.voronoi_fresnel,
     "contours": _contours,
@@ -93,7 +102,8 @@ class MaskConfig(
     - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose code
       and itself `combine`; `tiles`: how often an array is repeated along each axis.
     - `seed`: of what is random; `focal_length`, `lenses` (down, across): of "lenslets".
-    - `path`: of a grey image, a "file", whose pixels make up the `width`.
+    - `path`: of a grey image, a "file", whose pixels make up the `width`; of a "phase", rad in a
+      .npy or parts of a turn in an image.
     - `correlation_length`, `rms_slope`: of a "diffuser"; `sites`: lenses of "voronoi_fresnel", made
       for the wavelength; `feature`, `line_width`: of the "contours" that are the PSF far away, at
       the wavelength and distance of the first shot. `index`: of refraction, of all three, whose

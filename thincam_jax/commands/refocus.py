@@ -1,26 +1,18 @@
 """Experiments of `kind: refocus`: the file, the study of its scene, its run and its page."""
 
-from dataclasses import asdict, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.schema import section
-from thincam_jax.commands.sections import (
-    CamerasConfig,
-    Name,
-    TargetConfig,
-    check_known,
-    check_names,
-)
-from thincam_jax.commands.study.build import assemble, check_optics, read_picture
-from thincam_jax.imaging.targets import middle_square
+from thincam_jax.commands.sections import CamerasConfig, Name, TargetConfig, check_known
+from thincam_jax.commands.study.build import assemble, cropped, with_targets
 from thincam_jax.plot import refocus as plot
 from thincam_jax.plot.frame import grey_levels, white_level
 from thincam_jax.studies.refocus import (
@@ -31,7 +23,7 @@ from thincam_jax.studies.refocus import (
     SceneObject,
     place,
 )
-from thincam_jax.studies.study import Target
+from thincam_jax.studies.study import Study, Target
 
 _SWEEP = (
     "Reconstructions from the same captures, focused on the distance above each; one grey scale "
@@ -79,7 +71,6 @@ class RefocusConfig(CamerasConfig):
 
     @pydantic.model_validator(mode="after")
     def _objects_fit(self):
-        check_names(self, "objects")
         names = [method.name for method in self.methods]
         check_known(self.sweep.method, "method", names, "sweep", "method")
         for index, placed in enumerate(self.objects):
@@ -97,22 +88,12 @@ def build_refocus(config: RefocusConfig) -> RefocusStudy:
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
     """
-    study, wrong = assemble(config), []
-    try:
-        check_optics(study)
-    except ConfigError as error:
-        wrong.append(str(error))
 
-    def read(placed: PlacedConfig) -> Target:
-        picture = read_picture(placed)
-        if placed.crop < 1:
-            picture = middle_square(picture, round(placed.crop * min(picture.shape[:2])))
-        return place(study, 0, placed.build(name=placed.name, picture=picture))
+    def read(study: Study | None, placed: PlacedConfig) -> Target | None:
+        picture = cropped(placed)
+        return study and place(study, 0, placed.build(name=placed.name, picture=picture))
 
-    objects, faults = config.read_each("objects", read, "path")
-    if wrong or faults:
-        raise ConfigError("\n".join([*wrong, *faults]))
-    return RefocusStudy(replace(study, targets=tuple(objects)), config.sweep.build())
+    return RefocusStudy(with_targets(config, lambda: assemble(config), read), config.sweep.build())
 
 
 def run_refocus(refocusing: RefocusStudy, folder: RunFolder, progress: Progress) -> RefocusResult:
@@ -132,15 +113,8 @@ class _RefocusRun(Run):
     def report(self) -> None:
         folder, result = self.folder, self.running.result
         study = result.refocusing.study
-        self.metrics = {
-            "study": study.name,
-            "kind": self.config.kind,
-            "seed": study.seed,
-            "objects": {name: asdict(one) for name, one in result.objects.items()},
-            "sweep": _sweep_metrics(result),
-            "methods": {name: asdict(one) for name, one in result.methods.items()},
-            "warnings": study.warnings,
-        }
+        self.metrics = {"study": study.name, "kind": self.config.kind, "seed": study.seed}
+        self.metrics |= result.metrics() | {"warnings": study.warnings}
         places = {name: one.distance_mm for name, one in result.objects.items()}
         folder.save_figure("sweep", plot.draw_sweep(result.sweep, places))
         folder.write("figures/sweep.webp", plot.animate_sweep(result.sweep))
@@ -153,23 +127,6 @@ class _RefocusRun(Run):
             folder.save_image(f"{slug(name)}--{distance:g}mm", shown)
         folder.save_figure("methods", plot.draw_methods(result))
         self.complete(page(self.config, result))
-
-
-def _sweep_metrics(result: RefocusResult) -> dict[str, Any]:
-    """The focus curves as numbers."""
-    sweep, asked = result.sweep, result.refocusing.sweep
-    curves = {name: result.found.curve(name) for name in result.objects}
-    return {
-        "method": asked.method,
-        "measure": asked.measure,
-        "distances_mm": [round(float(t), 4) for t in sweep.distances],
-        "slope_per_pixel": float(f"{float(sweep.slope):.6g}"),  # pyright: ignore[reportArgumentType]
-        "curves": {
-            name: [float(f"{v:.6g}") for v in curve]
-            for name, curve in curves.items()
-            if curve is not None
-        },
-    }
 
 
 def page(config: RefocusConfig, result: RefocusResult) -> Page:

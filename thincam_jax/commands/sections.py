@@ -266,7 +266,7 @@ class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
 
     @pydantic.model_validator(mode="after")
     def _methods_fit(self):
-        check_names(self, "methods")
+        check_names(self, "methods", self.pictured)
         _check_family(self)
         methods = []
         for index, method in enumerate(self.methods):
@@ -292,11 +292,6 @@ class StudyConfig(CamerasConfig):
     @property
     def motion(self) -> float:
         return self.object.motion
-
-    @pydantic.model_validator(mode="after")
-    def _targets_fit(self):
-        check_names(self, "targets")
-        return self
 
 
 def check_known(name: str, what: str, names: Sequence[str], *place: Any) -> None:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -400,6 +401,33 @@ class AccuracyRun:
         """All that is done."""
         psfs = tuple(row for errors in self.psfs for row in errors.rows)
         return AccuracyResult(psfs, tuple(self.captures.rows), self.reconstructions.costs)
+
+    def record(self) -> dict[str, Any]:
+        """The result as numbers, with its settings."""
+        study, found = self.study, dataclasses.asdict(self.result)
+        costs = found["reconstructions"]
+        for rows in (found["captures"], costs["models"], costs["controlled"]):
+            for row in rows:  # without the figures of one that was not run
+                for key in [key for key, value in row.items() if value is None and key != "reason"]:
+                    del row[key]
+        settings = {
+            "study": study.name,
+            "reference": "separable, float64",
+            "sizes": list(self.sizes),
+            "camera": _numbers(study.exposures[0]),
+            "object_distance_mm": study.object_distance,
+            "pixel_integration": study.pixel_integration,
+            "capture_shape": list(self.case.study.sensor.shape),
+            "target": self.case.target.name,
+            "captured": _numbers(self.case.method.exposures[0]),
+        }
+        return {"settings": settings} | found
+
+
+def _numbers(exposure: Exposure) -> dict[str, Any]:
+    names = "beta_rad_per_mm2", "phase_rad", "distance_mm", "wavelength_mm"
+    numbers = exposure.beta, exposure.phase, exposure.distance, exposure.wavelength
+    return dict(zip(names, numbers, strict=True))
 
 
 def measure_accuracy(

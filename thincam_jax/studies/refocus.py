@@ -7,7 +7,7 @@ section 3.5.2).
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -330,6 +330,22 @@ class RefocusResult:
     objects: dict[str, ObjectScores]
     methods: dict[str, RefocusedMethod]
     images: dict[tuple[str, float], np.ndarray]
+
+    def metrics(self) -> dict[str, Any]:
+        """Objects, focus curves and methods as numbers."""
+        sweep, asked = self.sweep, self.refocusing.sweep
+        curves = {name: self.found.curve(name) for name in self.objects}
+        known = {name: curve for name, curve in curves.items() if curve is not None}
+        focused = {
+            "method": asked.method,
+            "measure": asked.measure,
+            "distances_mm": [round(float(t), 4) for t in sweep.distances],
+            "slope_per_pixel": float(f"{float(np.asarray(sweep.slope)):.6g}"),
+            "curves": {name: [float(f"{v:.6g}") for v in curve] for name, curve in known.items()},
+        }
+        objects = {name: asdict(one) for name, one in self.objects.items()}
+        methods = {name: asdict(one) for name, one in self.methods.items()}
+        return {"objects": objects, "sweep": focused, "methods": methods}
 
     def table(self) -> Table:
         """Where objects were placed, and where they were found."""

@@ -274,6 +274,7 @@ def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, t
         ("rig_pictures", 8),
         ("rig_scene", 24),
         ("rig_alignment", 14),
+        ("rig_phase", 4),
     ],
 )
 def test_shipped_files(name, steps):

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, pictures, pixel_levels, zone_plate
+from thincam_jax.hardware.acquisition.plan import (
+    BLACK,
+    Pattern,
+    levels_pattern,
+    pictures,
+    zone_plate,
+)
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
@@ -120,7 +126,7 @@ def test_a_picture_is_the_one_of_the_plan():
 
 def test_levels_of_pixels_are_in_the_middle_one_to_one():
     levels = np.random.default_rng(0).integers(0, 256, (6, 9), np.uint8)
-    pattern = pixel_levels("lens", levels)
+    pattern = levels_pattern("lens", levels)
     shown = pattern_levels(pattern, SHAPE, PITCH, {"lens": levels})
     np.testing.assert_array_equal(shown[9:15, 15:24], levels)
     assert shown.sum() == levels.sum(dtype=int) and pattern.label == "lens"

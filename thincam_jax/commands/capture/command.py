@@ -173,11 +173,14 @@ def known_drivers(connected: bool = False, asked: str | None = None) -> list[str
 def build_plan(config: "CaptureConfig") -> "Plan":
     """The plan of a file, with its settings."""
     from thincam_jax.commands.capture.run import picture_levels
+    from thincam_jax.hardware.acquisition.plan import levels_pattern
     from thincam_jax.hardware.base import CameraSettings
 
-    settings = config.camera.build(CameraSettings)
-    zero = 0.0 if config.optics is None else config.optics.distance
-    plan = config.plan.build().plan(settings, stage_zero=zero, shown=picture_levels(config))
+    settings, shown = config.camera.build(CameraSettings), picture_levels(config)
+    given = {"stage_zero": 0.0 if config.optics is None else config.optics.distance, "shown": shown}
+    if config.mask is not None:
+        given["mask"] = levels_pattern(*shown.popitem())
+    plan = config.plan.build().plan(settings, **given)
     if config.stage is not None:  # it stands where the optics are known
         plan = plan.at_position(0.0)
     return plan
@@ -198,7 +201,8 @@ def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
         try:
-            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual, pictures))
+            given = {"turns_phase": config.mask is not None}
+            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual, pictures, **given))
         except (ValueError, TypeError) as error:
             raise ConfigError(f"options: {error}") from None
         _shown(rig.render, plan.patterns[0])
@@ -212,8 +216,8 @@ def _shown(render: Callable[["Pattern"], Any], pattern: "Pattern") -> Any:
     try:
         return render(pattern)
     except ValueError as error:
-        key = {"fza": "width", "mark": "spread"}.get(pattern.kind, "cells")
-        raise ConfigError(f"plan.{key}: {error}") from None
+        keys = {"fza": "plan.width", "mark": "plan.spread", "pixels": "mask"}
+        raise ConfigError(f"{keys.get(pattern.kind, 'plan.cells')}: {error}") from None
 
 
 def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
@@ -239,6 +243,9 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
         plane = build_study(config, virtual.sensor).targets[0].plane
         scene, sensor = Scene(plane, optics.wavelength), Sensor(virtual.sensor, config.camera.pitch)
         light = optics.distance, virtual.electrons, display.fill_factor
+        if display.phase_levels is not None:
+            (levels,) = picture_levels(config).values()
+            light += (virtual.phase_levels or display.phase_levels).build(), levels.shape
         seen = ModulatorOptics(scene, sensor, display.pitch, *light)
     given = {"electronics": virtual.build(Electronics), "display_shape": virtual.display}
     return virtual.build(VirtualRig, optics=seen, seed=config.seed, **given)

@@ -1,12 +1,14 @@
 """Experiment files of `kind: capture`: the devices of a rig, the plan, and what is seen."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.schema import Length, Section, Wavelength, section
 from thincam_jax.commands.screen.config import (
     ScreenMethodConfig,
@@ -24,6 +26,7 @@ from thincam_jax.commands.sections import (
 from thincam_jax.hardware.acquisition.request import MONITOR, PlanRequest
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.hardware.virtual.optics import MonitorPose
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor
@@ -46,14 +49,33 @@ class CameraConfig(DeviceConfig, section(CameraSettings), section(Sensor, only=(
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
 
 
+class PhaseLevelsConfig(section(PhaseLevels)):
+    """`thincam_jax.hardware.displays.PhaseLevels`; or the path of its JSON file."""
+
+
+def _read(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    return PhaseLevelsConfig.model_construct(**asdict(PhaseLevels.read(given)))
+
+
+PhaseTable = Annotated[
+    PhaseLevelsConfig, BeforeValidator(_read, json_schema_input_type=PhaseLevelsConfig | str)
+]
+
+
 class DisplayConfig(
     DeviceConfig,
     section(FresnelZoneAperture, only=("fill_factor",)),
     section(Procedure, only=("settle",), defaults={"settle": None}),
 ):
-    """The modulator or monitor; `pitch`: of its pixels; `settle`: left out, it is measured."""
+    """The modulator or monitor; `pitch`: of its pixels; `settle`: left out, it is measured.
+
+    - `phase_levels`: of a phase modulator, which shows the file's `mask`.
+    """
 
     pitch: Length | None = None
+    phase_levels: PhaseTable | None = None
 
 
 class PlanConfig(section(PlanRequest)):
@@ -96,6 +118,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
       a screen, of the brightest pixel before a white monitor.
     - `screen`: a see-through camera before a monitor, for a Hadamard plan.
     - `monitor`: where it really stands, before a lensless camera.
+    - `phase_levels`: what a phase modulator really does; default as of the display.
     """
 
     sensor: tuple[Count, Count]
@@ -103,6 +126,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
     electrons: Annotated[float, Field(gt=0)]
     screen: SeeThroughConfig | None = None
     monitor: MonitorConfig = MonitorConfig()
+    phase_levels: PhaseTable | None = None
 
 
 class CaptureConfig(ExperimentConfig):
@@ -113,6 +137,7 @@ class CaptureConfig(ExperimentConfig):
       one; or the pictures of a plan of kind pictures, on its cells.
     - `matrix`: with which such pictures, or a scene, are reconstructed: matrix.zarr of a
       calibration's run, or the store of its captures; by `methods`.
+    - `mask`: on a phase modulator, in pixels of the display.
     - `alignment`: alignment.json of such a plan: shows pictures where a lensless model has them.
     """
 
@@ -122,6 +147,7 @@ class CaptureConfig(ExperimentConfig):
     display: DisplayConfig = DisplayConfig(driver="shutter")
     stage: DeviceConfig | None = None
     plan: PlanConfig
+    mask: MaskConfig | None = None
     acquisition: AcquisitionConfig = AcquisitionConfig()
     optics: OpticsConfig | None = None
     reconstruction: ReconstructionConfig = ReconstructionConfig()
@@ -147,6 +173,8 @@ class CaptureConfig(ExperimentConfig):
         yield from plan.rules(given, self.display.pitch, len(self.targets), simulated)
         corrected = kind == "grey_levels" and self.display.options.get("grey_levels")
         yield corrected, "this plan measures it; drop it", "display", "options", "grey_levels"
+        unpaired = (self.display.phase_levels is None) != (self.mask is None)
+        yield unpaired, "and 'mask' belong together; give both", "display", "phase_levels"
         yield simulated and virtual is None, "rig: virtual needs this section", "virtual"
         if simulated and virtual is not None:
             unseen = kind not in MONITOR and not self.targets

@@ -10,7 +10,7 @@ import numpy as np
 from thincam_jax._core.table import Table
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.config_file import ConfigError, slug
-from thincam_jax.commands.mask import MaskConfig
+from thincam_jax.commands.mask import MaskConfig, built_mask
 from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.run import build_cameras, build_plane, published_figures
@@ -18,7 +18,7 @@ from thincam_jax.commands.sections import PHASES, PictureConfig, SensorConfig, b
 from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.measured import write_image
 from thincam_jax.measured.calibration import Alignment
 from thincam_jax.plot import rig as plot
@@ -193,14 +193,16 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     **Errors**: ConfigError for a picture that cannot be read.
     """
     plan, optics, display = config.plan, config.optics, config.display
-    assert optics is not None and plan.width is not None  # of lensless plans
+    assert optics is not None  # of lensless plans
     monitor = plan.kind in ("pictures", "alignment")  # the display is no mask
     other: Synthesis = "fringe_scanning" if plan.kind in ("fringe_scan", "method_a") else "separate"
     synthesis: Synthesis = "phase_pairs" if plan.kind == "method_b" else other
     phases = PHASES.get(synthesis, (plan.phase,))
     distances = plan.distances if plan.kind == "method_a" else (optics.distance,)
-    betas, distances = np.broadcast_arrays(plan.betas, distances)  # one of either
-    light = {"wavelength": optics.wavelength, "width": plan.width}
+    betas, distances = np.broadcast_arrays(plan.betas or 0.0, distances)  # one of either
+    width = plan.width if config.mask is None else config.mask.width
+    assert width is not None
+    light = {"wavelength": optics.wavelength, "width": width}
     exposures = Exposures(betas, distances, **light).at_phases(phases)
     solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
 
@@ -215,8 +217,14 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     given = {"width": plan.width, "profile": plan.profile} | ({} if monitor else pixels)
     mask = MaskConfig.model_construct(**given)
     sensor = SensorConfig.model_construct(shape=shape, pitch=config.camera.pitch)
+    if display.phase_levels is None:
+        built = build_optics(mask, sensor, exposures[0])
+    else:
+        (levels,) = picture_levels(config).values()
+        seen = display.pitch, optics.wavelength, display.fill_factor
+        built = display.phase_levels.build().mask(levels, *seen), sensor.build()
     return Study(
-        *build_optics(mask, sensor, exposures[0]),
+        *built,
         (Method(plan.kind, exposures, solver, synthesis, len(phases)),),
         tuple(config.read_all("targets", grey)),
         object_distance=optics.object.distance,
@@ -229,8 +237,17 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
 def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
     """Of the pictures that a matrix is for, uint8, by name: none of a real rig's scene.
 
-    **Errors**: ConfigError for pictures that cannot be read.
+    Of a phase modulator those of its mask. **Errors**: ConfigError for what cannot be shown.
     """
+    if config.mask is not None:
+        table, light, pitch = config.display.phase_levels, config.optics, config.display.pitch
+        assert table is not None and light is not None
+        exposure = Exposure(0.0, 0.0, light.distance, light.wavelength, config.mask.width)
+        try:
+            shown = built_mask(config.mask, exposure), pitch, light.wavelength
+            return {config.mask.label: table.build().levels_of(*shown)}
+        except (ValueError, TypeError, OSError) as error:
+            raise ConfigError(f"{config.place_of('mask')}mask: {error}") from None
     if config.cells is None or not (config.matrix or config.alignment):
         return {}
 

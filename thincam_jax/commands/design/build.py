@@ -85,7 +85,7 @@ def build_designs(config: DesignConfig) -> Study:
             config=config,
         )
 
-    study = build.with_targets(config, config.object, assembled)
+    study = build.with_targets(config, assembled)
     for target in study.targets:
         rows, columns = target.plane.image.shape[-2:]
         if config.prior.measured and target.is_picture and min(rows, columns) < _SMALLEST_PICTURE:
@@ -213,19 +213,15 @@ def as_study_config(config: DesignConfig, methods: tuple[Method, ...]) -> StudyC
 
     Nothing is checked again: its numbers were.
     """
+    alike = "seed", "wavelength", "model", "pixel_integration", "object", "targets"
     return StudyConfig.model_construct(
         name=f"{config.name} found"[:60],
         title=f"{config.title or config.name}: the designs found",
-        seed=config.seed,
-        wavelength=config.wavelength,
-        model=config.model,
-        pixel_integration=config.pixel_integration,
         sensor=_sensor(config),
         mask=MaskConfig.model_construct(**dict(config.mask)),
-        object=config.object,
         noise=config.noise.simulated(),
         methods=tuple(_method_config(config, method) for method in methods),
-        targets=config.targets,
+        **{name: getattr(config, name) for name in alike},
     )
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.mask import MaskConfig, built_mask
 from thincam_jax.commands.sections import (
     CamerasConfig,
-    ObjectConfig,
     PictureConfig,
     SensorConfig,
     StudyConfig,
@@ -31,11 +31,14 @@ def build_study(config: StudyConfig) -> Study:
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
     """
-    return with_targets(config, config.object, lambda: assemble(config))
+    return with_targets(config, lambda: assemble(config))
 
 
-def with_targets(config: Any, seen: ObjectConfig, make: Callable[[], Study]) -> Study:
-    """The study that a function makes, with the targets of a file where its object stands.
+def with_targets(config: Any, make: Callable[[], Study], read: Any = None) -> Study:
+    """The study that a function makes, with the targets of a file.
+
+    `read`: a target of the study, None where that cannot be built, and of an entry; by default
+    where the file's object stands.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field: cameras that cannot
     be built, images that cannot be read or that no method can be scored on.
@@ -47,14 +50,15 @@ def with_targets(config: Any, seen: ObjectConfig, make: Callable[[], Study]) -> 
     except ConfigError as error:
         wrong.append(str(error))
 
-    def read(entry: TargetConfig) -> Target:
-        image = read_picture(entry)
+    def standing(study: Study | None, entry: TargetConfig) -> Target:
+        seen, image = config.object, read_picture(entry)
         target = Target.of_image(entry.name, image, seen.distance, seen.width, entry.kind)
         if study is not None:
             check_target(study, target)
         return target
 
-    targets, faults = config.read_each("targets", read, "path")
+    read = partial(read or standing, study)
+    targets, faults = config.read_each(config.pictured, read, "path")
     if study is None or wrong or faults:
         raise ConfigError("\n".join([*wrong, *faults]))
     return replace(study, targets=tuple(targets))
@@ -105,6 +109,14 @@ def read_picture(target: TargetConfig) -> np.ndarray:
     return getattr(drawn, target.kind)(shape)
 
 
+def cropped(target: Any) -> np.ndarray:
+    """The middle of a picture, `crop` of its shorter side."""
+    picture = read_picture(target)
+    if target.crop == 1:
+        return picture
+    return drawn.middle_square(picture, round(target.crop * min(picture.shape[:2])))
+
+
 def picture(
     target: PictureConfig, cells: tuple[int, int] | None = None, channels: int = 0
 ) -> np.ndarray:
@@ -114,9 +126,7 @@ def picture(
 
     **Errors**: ValueError for a uniform picture, FileNotFoundError where there is none.
     """
-    picture = np.atleast_3d(read_picture(target))
-    if target.crop < 1:
-        picture = drawn.middle_square(picture, round(target.crop * min(picture.shape[:2])))
+    picture = np.atleast_3d(cropped(target))
     picture = picture if channels else picture.mean(axis=-1)
     picture = drawn.resize(picture, cells or (picture.shape[0], picture.shape[1]))
     if channels:

@@ -12,7 +12,6 @@ from pyarrow import csv
 
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sweep.point import GridPoint, Outcome, described, measure_point, one_line
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 
@@ -26,20 +25,14 @@ class SweepFolder(RunFolder):
 
     - `study.yaml`: the resolved configuration that every point begins from.
     - `points/KEY.parquet`: the row of a point that succeeded, `points/KEY.failed.json` why one
-      failed; written when it ends. KEY stands for the point's configuration.
+      failed; written when it ends. KEY stands for the point's configuration: other grids of the
+      same study are welcome.
     - `results.parquet`, the same as `results.csv`, and `failures.jsonl`: those of the current grid,
       in its order. `summary.png`: PSNR along its axes, of a sweep that has ended.
     """
 
     kind, config, folders = "sweep", "study.yaml", ("points",)
     others, result = ("results.parquet",), "results.csv"
-
-    def claim(self, config: Section) -> None:
-        """Make the folder; refuse one of another study, or of other things.
-
-        Another grid of the same study is welcome: points are recognised by their configuration.
-        """
-        self.make(config)
 
     def has(self, point: GridPoint) -> bool:
         """Whether the point has succeeded before; a row that cannot be read does not count."""

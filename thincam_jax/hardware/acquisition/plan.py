@@ -283,16 +283,12 @@ def pictures(
     """
     shots = []
     for name, levels in shown.items():
-        shots += [(_named("picture", name, levels), None)] * frames
+        shots += [(levels_pattern(name, levels, "picture"), None)] * frames
     return _plan("pictures", shots, settings, dark_frames)
 
 
-def pixel_levels(name: str, levels: np.ndarray) -> Pattern:
-    """Levels (row, column), uint8, of the pixels in the middle of a display, for `scene`."""
-    return _named("pixels", name, levels)
-
-
-def _named(kind: str, name: str, levels: np.ndarray) -> Pattern:
+def levels_pattern(name: str, levels: np.ndarray, kind: str = "pixels") -> Pattern:
+    """Levels (row, column), uint8, of the pixels in the middle of a display, or of cells."""
     numbers = {"rows": levels.shape[0], "columns": levels.shape[1]}
     return Pattern(kind, {"name": name, "digest": picture_digest(levels), **numbers})
 

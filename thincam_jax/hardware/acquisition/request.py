@@ -129,9 +129,8 @@ class PlanRequest:
         yield unknown, f"{kind} is shown on pixels; give it", "display", "pitch"
         maskless = optics and self.width is None and not by_cells and not mask
         yield maskless, "optics need betas and width of the mask; give them", "plan", "width"
-        yield mask and (name not in SHOWN or not optics), f"{kind} takes none; drop it", "mask"
-        both = mask and (self.betas or self.width)
-        yield both, "the file has a 'mask' in their place; drop them", "plan", "betas"
+        fault = f"is of a {' or '.join(SHOWN)} with optics and without betas and width; drop it"
+        yield mask and (name not in SHOWN or not optics or self.betas or self.width), fault, "mask"
         unfit = by_cells == optics and (by_cells or simulated or name not in ANYTHING)
         yield unfit, f"{kind} {'takes no' if by_cells else 'needs'} optics", "optics"
         yield pictures and not (optics or matrix), f"{kind} needs it", "matrix"

@@ -15,8 +15,6 @@ from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax.hardware.displays.grey_levels import LEVELS
 from thincam_jax.lensless.masks import AbstractMask, SampledMask
 
-_TURN = 2 * np.pi
-
 
 @dataclass(frozen=True)
 class PhaseLevels:
@@ -26,8 +24,7 @@ class PhaseLevels:
       they are interpolated linearly.
     - `wavelength`: at which they were measured, mm.
     - `tolerance`: width of the interval about a phase in which a level has to lie, rad.
-    - `gap`: amplitude of the light of the dead space between pixels, which keeps the phase 0, over
-      that of a pixel: part of the zero order.
+    - `gap`: amplitude of the dead space between pixels over theirs, of phase 0: zero order.
     """
 
     phases: Annotated[tuple[float, ...], quantity("rad", many=True)]
@@ -59,18 +56,21 @@ class PhaseLevels:
         table = np.interp(np.arange(LEVELS), steps, self.phases)
         return table * (self.wavelength / wavelength)
 
-    def levels(self, phase: np.ndarray, wavelength: float) -> np.ndarray:
-        """Levels (y, x), uint8, whose phases at a wavelength, mm, are nearest to given ones, rad.
+    def field(self, levels: np.ndarray, wavelength: float) -> np.ndarray:
+        """Complex amplitude of each pixel's open part."""
+        return np.exp(1j * self.at(wavelength))[levels]
 
-        Whole turns do not count.
+    def levels(self, phase: np.ndarray, wavelength: float) -> np.ndarray:
+        """Levels (y, x), uint8, of the phases at a wavelength, mm, nearest on the circle to others.
 
         **Errors**: ValueError where no level is within half the tolerance of a phase.
         """
         table = self.at(wavelength)
-        apart, levels = KDTree(_on_circle(table)).query(_on_circle(phase))
-        error, allowed = 2 * np.arcsin(np.minimum(np.max(apart) / 2, 1)), self.tolerance / 2
+        known, asked = (np.dstack([np.cos(one), np.sin(one)]) for one in (table, phase))
+        apart, levels = KDTree(known[0]).query(asked)
+        error, allowed = 2 * np.arcsin(np.minimum(apart.max() / 2, 1)), self.tolerance / 2
         if error > allowed:
-            worst = np.mod(phase.ravel()[np.argmax(apart)], _TURN)
+            worst = phase.ravel()[np.argmax(apart)] % (2 * np.pi)
             raise ValueError(
                 f"the phase {worst:.3g} rad is {error:.2g} rad from the nearest level, of which "
                 f"the modulator has {table.min():.3g} to {table.max():.3g} rad, and {allowed:.2g} "
@@ -85,8 +85,9 @@ class PhaseLevels:
         """
         sides = zip(("height", "width"), mask.extent, strict=True)
         rows, columns = (checks.whole_cells(name, side, "pitch", pitch) for name, side in sides)
-        phase = np.angle(np.asarray(mask.sample(Grid((rows, columns), pitch), wavelength)))
-        if not phase.any():
+        sampled = np.asarray(mask.sample(Grid((rows, columns), pitch), wavelength))
+        phase = np.angle(sampled)
+        if not np.iscomplexobj(sampled) or not phase.any():
             raise ValueError("it turns no phase; give lenslets, a relief or a phase of a file")
         return self.levels(phase, wavelength)
 
@@ -97,9 +98,5 @@ class PhaseLevels:
 
         - `pitch`: of the pixels, mm. `fill_factor`: of a pixel's area, which turns the phase.
         """
-        amplitude = np.exp(1j * self.at(wavelength))[levels]
-        return SampledMask(amplitude, pitch, fill_factor=fill_factor, gap=self.gap)
-
-
-def _on_circle(phase: np.ndarray) -> np.ndarray:
-    return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+        given = {"fill_factor": fill_factor, "gap": self.gap or None}
+        return SampledMask(self.field(levels, wavelength), pitch, **given)

@@ -31,8 +31,7 @@ from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 from thincam_jax.measured.calibration.alignment import to_indices
 
 _TERMS = 4  # singular terms of a pattern that are averaged exactly
-_POINTS = 4  # along a pixel, for the remainder
-_LITTLE = 0.02  # of the amplitude, a remainder for which these are enough
+_POINTS = 4  # along a pixel, for the remainder of real amplitudes
 _FINE = 4  # samples of a monitor along a cell
 
 
@@ -83,9 +82,14 @@ class ModulatorOptics:
         image = np.zeros(self.sensor.shape, np.float32)
         if not shown.any():
             return image
-        shown = _middle(shown) if self.phases is None else _cropped(shown, self.aperture)
+        if self.phases is None:
+            shown = _middle(shown)
+        elif self.aperture is not None:
+            top, left = ((n - k) // 2 for n, k in zip(shown.shape, self.aperture, strict=True))
+            shown = shown[top : top + self.aperture[0], left : left + self.aperture[1]]
+        field = self.phases.field if self.phases else lambda shown, _: np.sqrt(shown / 255)
         # Only the size of this mask is used; its transmittances act in the PSF.
-        mask = SampledMask(shown, self.pixel_pitch)
+        mask = SampledMask(shown / 255, self.pixel_pitch)
         camera = LenslessCamera(mask, self.sensor, self.distance + position)
         grid, spectrum = self.sensor.grid, self.scene.spectrum
         for plane in self.scene.planes:
@@ -93,7 +97,7 @@ class ModulatorOptics:
             kernels = [
                 weight
                 * pixelated_psf(
-                    self._amplitude(shown, float(wavelength)),
+                    field(shown, float(wavelength)),
                     kernel_grid(grid, shape),
                     camera.path(wavelength, plane.distance),
                     pixel_pitch=self.pixel_pitch,
@@ -106,17 +110,6 @@ class ModulatorOptics:
             convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)
             image = image + np.asarray(convolution(project(camera, plane, shape)))
         return (self.electrons * image).astype(np.float32)
-
-    def _amplitude(self, shown: np.ndarray, wavelength: float) -> np.ndarray:
-        if self.phases is None:
-            return np.sqrt(shown / 255)
-        return np.exp(1j * self.phases.at(wavelength))[shown]
-
-
-def _cropped(shown: np.ndarray, shape: tuple[int, int] | None) -> np.ndarray:
-    rows, columns = shape or shown.shape
-    top, left = (shown.shape[0] - rows) // 2, (shown.shape[1] - columns) // 2
-    return shown[top : top + rows, left : left + columns]
 
 
 def _middle(shown: np.ndarray) -> np.ndarray:
@@ -147,7 +140,7 @@ def pixelated_psf(
     approximation. By singular value decomposition of A the field is a sum of separable terms, three
     for a grey Fresnel zone aperture, and so is the irradiance of the largest ones, whose pixel
     averages are one-dimensional. The remainder, such as the rounding to 8 bits, is averaged over a
-    few points of each pixel; where it is more, as of phases, over as many as its fringes need.
+    few points of each pixel; that of phases, which is more, over as many as its fringes need.
 
     `gap`: amplitude between the open parts, that of a slit over all pixels less these.
     """
@@ -157,8 +150,7 @@ def pixelated_psf(
     left, strength, right = np.linalg.svd(amplitude, full_matrices=False)
     down, across = left[:, :_TERMS] * strength[:_TERMS], right[:_TERMS].T
     nodes = pixel_nodes(mask, grid, path, "float64" if dtype == jnp.float64 else "float32")
-    little = np.linalg.norm(strength[_TERMS:]) < _LITTLE * np.linalg.norm(strength)
-    points = _POINTS if little else nodes
+    points = nodes if np.iscomplexobj(amplitude) else _POINTS
     places = np.concatenate([leggauss(nodes)[0], leggauss(points)[0]]) / 2
     offsets = grid.pitch * jnp.asarray(places, dtype)[:, None]
     slit = jnp.asarray(pixel_pitch, dtype), jnp.asarray(fill_factor, dtype)

@@ -107,30 +107,26 @@ class SampledMask(AbstractFactoredMask):
         return self._terms(self.amplitude, self.gap)
 
     def irradiance(self, wavelength: Number | None = None) -> MaskTerms:
-        gap = None if self.gap is None else self.gap**2
-        return self._terms(jnp.abs(self.amplitude) ** 2, gap)
+        return self._terms(jnp.abs(self.amplitude) ** 2, None if self.gap is None else self.gap**2)
 
     def _terms(self, values, gap) -> MaskTerms:
         """A term for each row of the values, or for each column; one of the whole, with a gap."""
-        rows, columns = values.shape
         values = values if jnp.iscomplexobj(values) else as_complex(values)
+        if gap is not None:
+            gap = as_complex(gap)
+            values = jax.scipy.linalg.block_diag(values - gap, gap)
+        rows, columns = values.shape
         each = jnp.eye(min(rows, columns), dtype=values.dtype)
-        if gap is not None:
-            values = values - as_complex(gap)
         down, across = (each, values) if rows <= columns else (values.T, each)
-        weights = jnp.ones_like(each[0])
-        if gap is not None:
-            weights = jnp.append(weights, as_complex(gap))
-        return MaskTerms(weights, self._factors(down), self._factors(across))
+        return MaskTerms(jnp.ones_like(each[0]), self._factors(down), self._factors(across))
 
     def _factors(self, values: Complex[Array, "term cell"]) -> AxisFactors:
         if self.fill_factor is None:
             return AxisFactors(cell_edges(values.shape[1], self.pitch), values)
-        if self.gap is None:
-            return open_parts(values, self.pitch, self.fill_factor)
-        whole = jnp.zeros_like(values[:, :1]), jnp.ones_like(values[:1, :1])
-        values = jnp.concatenate([values, jnp.ones_like(values[:1])])
-        return open_parts(values, self.pitch, self.fill_factor, jnp.concatenate(whole))
+        gaps = None
+        if self.gap is not None:
+            values, gaps = values[:, :-1] + values[:, -1:], values[:, -1:]
+        return open_parts(values, self.pitch, self.fill_factor, gaps)
 
     def sample(self, grid: Grid, wavelength: Number | None = None) -> Transmittance:
         rows, columns = self.amplitude.shape
