@@ -242,7 +242,7 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     else:
         plane = build_study(config, virtual.sensor).targets[0].plane
         scene, sensor = Scene(plane, optics.wavelength), Sensor(virtual.sensor, config.camera.pitch)
-        light = optics.distance, virtual.electrons, display.fill_factor
+        light: Any = optics.distance, virtual.electrons, display.fill_factor
         if display.phase_levels is not None:
             (levels,) = picture_levels(config).values()
             light += (virtual.phase_levels or display.phase_levels).build(), levels.shape

@@ -95,7 +95,7 @@ def open_rig(
     from thincam_jax.hardware.virtual.devices import VirtualDevices
 
     with ExitStack() as stack:
-        openers = {
+        openers: dict[Any, Any] = {
             role: partial(open_device, f"{role}s", *given) for role, given in drivers.items()
         }
         if virtual is None:

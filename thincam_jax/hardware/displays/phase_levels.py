@@ -76,7 +76,7 @@ class PhaseLevels:
                 f"the modulator has {table.min():.3g} to {table.max():.3g} rad, and {allowed:.2g} "
                 f"are allowed; give a tolerance of {2 * error + 5e-3:.2f} rad, or a mask of less"
             )
-        return levels.astype(np.uint8)
+        return np.asarray(levels, np.uint8)
 
     def levels_of(self, mask: AbstractMask, pitch: float, wavelength: float) -> np.ndarray:
         """Levels of a mask that turns the phase, on pixels of a pitch, mm.
