@@ -22,6 +22,7 @@ from thincam_jax.studies.refocus import (
     RefocusStudy,
     SceneObject,
     place,
+    refocus_metrics,
 )
 from thincam_jax.studies.study import Study, Target
 
@@ -114,7 +115,7 @@ class _RefocusRun(Run):
         folder, result = self.folder, self.running.result
         study = result.refocusing.study
         self.metrics = {"study": study.name, "kind": self.config.kind, "seed": study.seed}
-        self.metrics |= result.metrics() | {"warnings": study.warnings}
+        self.metrics |= refocus_metrics(result) | {"warnings": study.warnings}
         places = {name: one.distance_mm for name, one in result.objects.items()}
         folder.save_figure("sweep", plot.draw_sweep(result.sweep, places))
         folder.write("figures/sweep.webp", plot.animate_sweep(result.sweep))

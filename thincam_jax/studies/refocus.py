@@ -331,22 +331,6 @@ class RefocusResult:
     methods: dict[str, RefocusedMethod]
     images: dict[tuple[str, float], np.ndarray]
 
-    def metrics(self) -> dict[str, Any]:
-        """Objects, focus curves and methods as numbers."""
-        sweep, asked = self.sweep, self.refocusing.sweep
-        curves = {name: self.found.curve(name) for name in self.objects}
-        known = {name: curve for name, curve in curves.items() if curve is not None}
-        focused = {
-            "method": asked.method,
-            "measure": asked.measure,
-            "distances_mm": [round(float(t), 4) for t in sweep.distances],
-            "slope_per_pixel": float(f"{float(np.asarray(sweep.slope)):.6g}"),
-            "curves": {name: [float(f"{v:.6g}") for v in curve] for name, curve in known.items()},
-        }
-        objects = {name: asdict(one) for name, one in self.objects.items()}
-        methods = {name: asdict(one) for name, one in self.methods.items()}
-        return {"objects": objects, "sweep": focused, "methods": methods}
-
     def table(self) -> Table:
         """Where objects were placed, and where they were found."""
         rows = [
@@ -395,6 +379,22 @@ class RefocusResult:
         from thincam_jax.plot.refocus import draw_methods
 
         return draw_methods(self, new_figure(1.0, 1.0))
+
+
+def refocus_metrics(result: RefocusResult) -> dict[str, Any]:
+    """Objects, focus curves and methods as numbers."""
+    sweep, asked = result.sweep, result.refocusing.sweep
+    found = {name: result.found.curve(name) for name in result.objects}
+    focused = {
+        "method": asked.method,
+        "measure": asked.measure,
+        "distances_mm": [round(float(t), 4) for t in sweep.distances],
+        "slope_per_pixel": float(f"{float(np.asarray(sweep.slope)):.6g}"),
+        "curves": {n: [float(f"{v:.6g}") for v in c] for n, c in found.items() if c is not None},
+    }
+    objects = {name: asdict(one) for name, one in result.objects.items()}
+    methods = {name: asdict(one) for name, one in result.methods.items()}
+    return {"objects": objects, "sweep": focused, "methods": methods}
 
 
 class RefocusRun:

@@ -87,10 +87,7 @@ class SampledMask(AbstractFactoredMask):
 
     @property
     def finest_frequency(self) -> float | None:
-        """Beyond which, along either axis, half of the modulation |t|² − mean lies, cycles/mm.
-
-        None of phases alone.
-        """
+        """Beyond which half of |t|² − mean lies, along either axis, cycles/mm; None of phases."""
         shadow = np.abs(np.asarray(self.amplitude)) ** 2
         if jnp.iscomplexobj(self.amplitude) and np.ptp(shadow) < 1e-5 * shadow.max():
             return None
