@@ -334,6 +334,7 @@ FITS = {
     "object": "moving",
     "plan": "rig_scene",
     "camera": "rig_scene",
+    "optics": "rig_colour",
     "methods": "fza_harmonics",
     "models": "stis",
     "guide/stis.md: mask": "stis",

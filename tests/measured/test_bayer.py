@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from thincam_jax.measured import demosaic, demosaic_mask
-from thincam_jax.measured.bayer import PATTERNS
+from thincam_jax.measured.bayer import PATTERNS, mosaic
 
 
 def mosaic_of(image, pattern):
@@ -13,6 +13,13 @@ def mosaic_of(image, pattern):
         for x in range(columns):
             seen[y, x] = image[y, x, "RGB".index(pattern[2 * (y % 2) + x % 2])]
     return seen
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_mosaic_has_one_colour_at_each_pixel(pattern):
+    colours = np.random.default_rng(3).normal(size=(2, 3, 5, 8))
+    for one, image in zip(mosaic(colours, pattern), colours, strict=True):
+        np.testing.assert_array_equal(one, mosaic_of(np.moveaxis(image, 0, -1), pattern))
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)

@@ -377,7 +377,5 @@ def build_solver(
 
         return PlugAndPlay()
     asked = variation or VariationConfig()
-    total = TotalVariation(
-        asked.kind, asked.coupling or "opponent", chroma_weight=asked.chroma_weight
-    )
-    return AdmmTV(asked.tau, variation=total, iterations=asked.iterations)
+    total = asked.build(TotalVariation, coupling=asked.coupling or "opponent")
+    return asked.build(AdmmTV, variation=total)

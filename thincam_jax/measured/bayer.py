@@ -66,6 +66,14 @@ def demosaiced(
     return np.stack(channels, axis=-1)
 
 
+def mosaic(
+    colours: Shaped[np.ndarray, "*batch 3 y x"], pattern: Pattern
+) -> Shaped[np.ndarray, "*batch y x"]:
+    """What a sensor with a pattern measures of red, green and blue light."""
+    sites = np.stack(list(colour_sites(colours.shape[-2:], pattern).values()))
+    return np.where(sites, colours, 0).sum(axis=-3)
+
+
 def shifted_pattern(pattern: Pattern, top: int, left: int) -> Pattern:
     """Pattern of the part of a mosaic that begins at a row and a column."""
     rows, columns = (top % 2, 1 - top % 2), (left % 2, 1 - left % 2)

@@ -63,7 +63,9 @@ def _stack(images, labels, pitch, levels, words) -> Figure:
 
 
 def draw_images(
-    images: Mapping[str, Float[np.ndarray, "y x"]], pitch: float, scores: Mapping[str, float | None]
+    images: Mapping[str, Float[np.ndarray, "y x *colour"]],
+    pitch: float,
+    scores: Mapping[str, float | None],
 ) -> Figure:
     """Images on the object, each from its own black to its own white.
 
@@ -80,9 +82,9 @@ def draw_images(
 
 
 def stretched(image: np.ndarray) -> np.ndarray:
-    """The image from its own black, 0, to its own white, 1; two in a thousand pixels are beyond."""
+    """The image from its own black, 0, to its own white, 1; of two in a thousand pixels."""
     low, high = np.quantile(image, (0.002, 0.998))
-    return (image - low) / (high - low)
+    return np.clip((image - low) / (high - low), 0, 1)
 
 
 def draw_seconds(seconds: Mapping[str, float]) -> Figure:

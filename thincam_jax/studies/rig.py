@@ -7,7 +7,7 @@ agree within the noise, the rig's geometry, electronics and bookkeeping are righ
 import math
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,35 +21,23 @@ from thincam_jax import waveguide as wg
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import CropConvolution, LowRank, ReducedMatrix, Sparse
+from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.measured import calibration
-from thincam_jax.reconstruction import (
-    AbstractSolver,
-    AdmmTV,
-    Reconstruction,
-    Recording,
-    Wiener,
-    reconstruct,
-)
+from thincam_jax.measured.bayer import Pattern, mosaic
+from thincam_jax.reconstruction import AbstractSolver, Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
-from thincam_jax.studies.evaluate import (
-    Reconstructor,
-    cameras_of,
-    coupled,
-    reconstructor,
-    rounded,
-    sample,
-)
+from thincam_jax.studies.evaluate import as_picture, rounded, sample
 from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
+from thincam_jax.studies.rig_images import FrameSolver, square_field
 from thincam_jax.studies.screen_calibration import diagonal_cells
 from thincam_jax.studies.simulate import noise_free
-from thincam_jax.studies.study import Method, Study
+from thincam_jax.studies.study import Study
 
 Pixels = tuple[slice, slice]
-FrameSolver = Callable[[Float[np.ndarray, "capture y x"]], Reconstruction]
+COLOURS = "red", "green", "blue"
 
 
 @dataclass(frozen=True)
@@ -70,77 +58,6 @@ class CountingCamera:
         return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
 
 
-def frame_solver(
-    study: Study, width: float, variance: Float[np.ndarray, "y x"] | None = None
-) -> FrameSolver:
-    """The function that reconstructs frames (capture, y, x) by the first method of a study.
-
-    - `width`: of the square object that the image covers, mm.
-    - `variance`: of each pixel of a frame, infinite where it is not known; AdmmTV takes the mean
-      and leaves those out, of a single frame. Else the noise is estimated from the frames.
-    """
-    method = study.methods[0]
-    if variance is not None and isinstance(method.solver, AdmmTV) and len(method.exposures) == 1:
-        return _masked_solver(study, method, width, variance)
-    solve = _solver_of(study, width)
-
-    def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
-        captures = jnp.asarray(frames[:, None], jnp.float32)
-        return solve(captures, estimate_noise(captures) ** 2)
-
-    return solved
-
-
-def _solver_of(study: Study, width: float) -> Reconstructor:
-    method, distance = study.methods[0], study.object_distance
-    return reconstructor(study, method, _field_shape(study, width), distance)
-
-
-def _field_shape(study: Study, width: float) -> tuple[int, int]:
-    side = max(1, round(width * study.methods[0].distance / study.object_distance / study.pitch))
-    return side, side
-
-
-def _masked_solver(
-    study: Study, method: Method, width: float, variance: Float[np.ndarray, "y x"]
-) -> FrameSolver:
-    """By the pixels that are known, equally: with weights of 1/variance images were worse."""
-    cameras = cameras_of(study, method, _field_shape(study, width), study.object_distance)
-    known, solver = np.isfinite(variance), coupled(method.solver, 1)
-    noise = {"noise_variance": float(variance[known].mean()), "valid": known}
-
-    def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
-        captures = jnp.asarray(frames[:, None], jnp.float32)
-        return reconstruct(Recording(captures, cameras, **noise), solver)
-
-    return solved
-
-
-def live_image(study: Study, width: float) -> Callable[[Float[np.ndarray, "y x"]], np.ndarray]:
-    """The function that makes an image, levels 0 to 1, of one frame of a study's first exposure.
-
-    By a Wiener filter, fast enough for a picture of what a camera sees now: without fringe scanning
-    a zone plate's background and twin image stay. The noise is estimated anew where the light has
-    changed by a fifth.
-    """
-    one = study.methods[0].exposures[0]
-    light = {"wavelength": one.wavelength, "width": one.width, "profile": one.profile}
-    first = Exposures(one.beta, one.distance, phase=one.phase, **light)
-    solve = _solver_of(replace(study, methods=(Method("live", first, Wiener()),)), width)
-    level, variance = 0.0, jnp.zeros((1, 1))
-
-    def levels(frame: Float[np.ndarray, "y x"]) -> np.ndarray:
-        nonlocal level, variance
-        captures, now = jnp.asarray(frame[None, None], jnp.float32), float(frame.mean())
-        if abs(now - level) > 0.2 * level or not level:
-            level, variance = now, estimate_noise(captures) ** 2
-        image = np.squeeze(np.asarray(solve(captures, variance).image))
-        low, high = np.quantile(image, (0.002, 0.998))
-        return (image - low) / max(high - low, 1e-30)
-
-    return levels
-
-
 @dataclass(frozen=True, eq=False)
 class RigFrames:
     """Frames of a rig, and the camera that took them, where it is known.
@@ -149,6 +66,7 @@ class RigFrames:
     - `pixels`: part of the sensor that was read, rows and columns.
     - `lit`: pixels of that part that see light.
     - `variance`: where the frames are means of several; infinite where a pixel is not known.
+    - `bayer`: pattern of the frames; None of grey ones.
     """
 
     frames: Float[np.ndarray, "capture y x"]
@@ -157,6 +75,7 @@ class RigFrames:
     lit: Bool[np.ndarray, "y x"]
     dark_frames: int = 0
     variance: Float[np.ndarray, "y x"] | None = None
+    bayer: Pattern | None = None
 
 
 @dataclass(frozen=True)
@@ -179,9 +98,12 @@ class FrameAgreement:
 
 @dataclass(frozen=True, eq=False)
 class FrameComparison:
-    """Images "scene", "captured", "simulated" and "without noise", PSNR, dB, and the agreement."""
+    """Images "scene", "captured", "simulated" and "without noise", PSNR, dB, and the agreement.
 
-    images: dict[str, Float[np.ndarray, "y x"]]
+    Images in colour are (y, x, 3), and each colour of the captured one has a PSNR, too.
+    """
+
+    images: dict[str, Float[np.ndarray, "y x *colour"]]
     psnr_db: dict[str, float | None]
     agreement: FrameAgreement
 
@@ -196,12 +118,12 @@ def compare_frames(
     """
     camera, target = rig.camera, study.targets[0]
     assert camera is not None
-    clean = camera.counts * np.stack(
-        [
-            np.asarray(noise_free(study, exposure, target.plane))[rig.pixels]
-            for exposure in study.methods[0].exposures
-        ]
-    )
+    light = [
+        np.stack([noise_free(study, exposure, [*scene.planes]) for exposure in method.exposures])
+        for method, scene in zip(study.methods, scenes_of(study), strict=True)
+    ]
+    part = np.stack(light, axis=1)[..., *rig.pixels]  # capture, colour, y, x
+    clean = camera.counts * (part[:, 0] if rig.bayer is None else mosaic(part, rig.bayer))
     variance, dark, lit = camera.variance(clean), np.zeros(clean.shape[1:]), rig.lit
     if rig.variance is not None:
         known = np.isfinite(rig.variance)
@@ -220,10 +142,13 @@ def compare_frames(
         return solve(frames.astype(np.float32))
 
     images = {"captured": captured, "simulated": simulated(1.0), "without noise": simulated(0.0)}
-    pixels = {name: np.squeeze(np.asarray(one.image, float)) for name, one in images.items()}
-    grid = Grid(pixels["captured"].shape, jnp.asarray(captured.pitch))
-    truth = np.asarray(sample(target.plane, grid), float)
+    pixels = {name: as_picture(np.asarray(one.image, float)) for name, one in images.items()}
+    grid = Grid(pixels["captured"].shape[:2], jnp.asarray(captured.pitch))
+    truth = as_picture(np.asarray(sample(target.plane, grid), float))
     scores = {name: rounded(psnr(image, truth)) for name, image in pixels.items()}
+    for number, colour in enumerate(COLOURS if rig.bayer else ()):
+        found = pixels["captured"][..., number]
+        scores[f"captured {colour}"] = rounded(psnr(found, truth[..., number]))
     pixels = {"scene": truth} | pixels
     noise = [np.std(pixels[n] - pixels["without noise"]) for n in ("captured", "simulated")]
     agreement = FrameAgreement(
@@ -232,6 +157,15 @@ def compare_frames(
         round(float(noise[0] / noise[1]), 4),
     )
     return FrameComparison(pixels, scores, agreement)
+
+
+def scenes_of(study: Study) -> list[Scene]:
+    """The first target in the light of each method: a channel of its image for each."""
+    plane = study.targets[0].plane
+    return [
+        Scene(replace(plane, image=image), method.exposures[0].wavelength)
+        for image, method in zip(plane.image, study.methods, strict=True)
+    ]
 
 
 def monitor_system(
@@ -390,7 +324,7 @@ def reconstruct_pictures(
 
 def lensless_system(study: Study, width: float) -> CropConvolution | LowRank:
     """From a monitor that covers so many mm to the sensor, by a study's first camera."""
-    shape = same_parity(_field_shape(study, width), study.sensor.shape)
+    shape = same_parity(square_field(study, width), study.sensor.shape)
     exposure = study.methods[0].exposures[0]
     light, method = exposure.wavelength, PsfMethod(study.model, pixel_integration=True)
     camera, distance = study.camera(exposure), study.object_distance
@@ -412,7 +346,7 @@ def align_display(
     **Errors**: MeasurementError where too few marks agree; see `fit_alignment`.
     """
     exposure = study.methods[0].exposures[0]
-    field = same_parity(_field_shape(study, study.config.object.width), (0, 0))
+    field = same_parity(square_field(study, study.config.object.width), (0, 0))
     wide = Sensor(tuple(np.add(study.sensor.shape, field).tolist()), study.pitch)
     psf = np.asarray(replace(study, sensor=wide).psf(exposure), float)
     pixel = -study.pitch * study.object_distance / exposure.distance  # turned by 180°

@@ -65,7 +65,7 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
     (levels,) = picture_levels(config).values()
     (target,), to_cells = config.targets, np.diag([1 / 2.5, 1 / 2.5, 1.0])
     (scene,) = build_study(config, (96, 112)).targets  # what is compared is what was shown
-    np.testing.assert_allclose(scene.plane.image, picture(target, (16, 16)), atol=1e-6)
+    np.testing.assert_allclose(scene.plane.image[0], picture(target, (16, 16)), atol=1e-6)
     wanted, inner = picture(target, (16, 16)), slice(4, 12)  # the display is not as high
     for pose, least, most in (matrix, 0.98, 1.0), (np.eye(3), -1.0, 0.7):
         seen = cells_seen(levels, (16, 16), to_cells @ pose @ np.diag([0.5, 0.5, 1.0]))

@@ -273,6 +273,7 @@ def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, t
         ("rig_hadamard", 1032),
         ("rig_pictures", 8),
         ("rig_scene", 24),
+        ("rig_colour", 8),
         ("rig_alignment", 14),
         ("rig_phase", 4),
     ],

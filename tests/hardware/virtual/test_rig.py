@@ -19,6 +19,7 @@ from thincam_jax.hardware.virtual.optics import (
     ModulatorOptics,
     MonitorOptics,
     MonitorPose,
+    MosaicOptics,
     cells_seen,
     cells_shown,
     pixelated_psf,
@@ -138,6 +139,16 @@ def test_cells_of_a_monitor_are_seen_by_the_given_operator(sparse):
     assert np.array_equal(cells_shown(shown, (4, 8)), cells)
     direct = 1e4 * np.asarray(operator(jnp.asarray(cells, float)))
     assert np.allclose(MonitorOptics(operator, 1e4)(shown, 0.0), direct, rtol=1e-5)
+
+
+def test_each_pixel_of_a_colour_sensor_sees_its_own_colour():
+    parts = [MonitorOptics(system(), electrons) for electrons in (1e4, 2e4, 3e4)]
+    optics, shown = MosaicOptics(parts, "GBRG"), np.full((4, 8), 255, np.uint8)
+    red, green, blue = (part(shown, 0.0) for part in parts)
+    found = optics(shown, 0.0)
+    assert found.shape == optics.sensor_shape == (20, 30)
+    for row, column, light in ((0, 0, green), (0, 1, blue), (1, 0, red), (1, 1, green)):
+        np.testing.assert_array_equal(found[row::2, column::2], light[row::2, column::2])
 
 
 def rig(**options):

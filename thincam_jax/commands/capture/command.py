@@ -115,7 +115,7 @@ def preview(
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.hardware.errors import HardwareError
         from thincam_jax.hardware.preview import Preview
-        from thincam_jax.studies.rig import live_image
+        from thincam_jax.studies.rig_images import live_image
 
         asked = load_experiment(config, tuple(set_ or ()), "capture")
         plan = build_plan(asked)
@@ -124,7 +124,8 @@ def preview(
                 image, region = None, asked.camera.region
                 if asked.optics is not None:
                     shape = (region.height, region.width) if region else rig.camera.sensor_shape
-                    image = live_image(build_study(asked, shape), asked.optics.object.width)
+                    seen = build_study(asked, shape), asked.optics.object.width
+                    image = live_image(*seen, plan.settings[0].bayer)
                 procedure = asked.acquisition.build(settle=asked.display.settle)
                 serve_page(Preview(rig, plan, procedure, image=image), asked.name, port, browser)
         except HardwareError as error:
@@ -223,11 +224,10 @@ def _shown(render: Callable[["Pattern"], Any], pattern: "Pattern") -> Any:
 def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     """The state and the optics that the virtual devices of a file share."""
     from thincam_jax.commands.capture.run import build_study, picture_levels, screen_system
-    from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics
+    from thincam_jax.hardware.base import CameraSettings
+    from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, MosaicOptics
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
-    from thincam_jax.imaging.scene import Scene
-    from thincam_jax.imaging.sensor import Sensor
-    from thincam_jax.studies.rig import lensless_system
+    from thincam_jax.studies.rig import lensless_system, scenes_of
 
     virtual, display, optics = config.virtual, config.display, config.optics
     assert virtual is not None  # checked with the file
@@ -240,13 +240,14 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
         system = lensless_system(build_study(config, virtual.sensor), optics.object.width)
         seen = MonitorOptics(system, virtual.electrons, place=place)
     else:
-        plane = build_study(config, virtual.sensor).targets[0].plane
-        scene, sensor = Scene(plane, optics.wavelength), Sensor(virtual.sensor, config.camera.pitch)
-        light: Any = optics.distance, virtual.electrons, display.fill_factor
+        study = build_study(config, virtual.sensor)
+        light: Any = display.pitch, optics.distance, virtual.electrons, display.fill_factor
         if display.phase_levels is not None:
             (levels,) = picture_levels(config).values()
             light += (virtual.phase_levels or display.phase_levels).build(), levels.shape
-        seen = ModulatorOptics(scene, sensor, display.pitch, *light)
+        parts = [ModulatorOptics(one, study.sensor, *light) for one in scenes_of(study)]
+        pattern = config.camera.build(CameraSettings, region=None).bayer
+        seen = parts[0] if pattern is None else MosaicOptics(parts, pattern)
     given = {"electronics": virtual.build(Electronics), "display_shape": virtual.display}
     return virtual.build(VirtualRig, optics=seen, seed=config.seed, **given)
 
@@ -266,12 +267,10 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     from thincam_jax.measured.calibration import open_captures
     from thincam_jax.studies.rig import CountingCamera, RigFrames
 
-    found, kind, camera, variance = read_acquisition(store), config.plan.kind, None, None
-    series = {
-        "hadamard": lambda: open_captures(store),
-        "grey_levels": lambda: measured_levels(found),
-    }
-    if kind in series:
+    found, kind = read_acquisition(store), config.plan.kind
+    camera, variance, calibration = None, None, None
+    if kind in ("hadamard", "grey_levels"):
+        calibration = open_captures(store) if kind == "hadamard" else measured_levels(found)
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
     elif kind == "scene" or config.alignment:
         frames, variance = found.scene()
@@ -291,10 +290,10 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     render = partial(pattern_levels, shape=tuple(display), **given)
     seconds = store / _SECONDS
     return Taken(
-        RigFrames(frames, camera, found.pixels, lit, darks, variance),
+        RigFrames(frames, camera, found.pixels, lit, darks, variance, found.settings[0].bayer),
         [pattern.label for pattern in patterns],
         [_shown(render, pattern) for pattern in patterns if config.display.pitch],
         [one.exposure for one in found.settings],
         json.loads(read_regular(seconds)) if seconds.is_file() else {},
-        series[kind]() if kind in series else None,
+        calibration,
     )

@@ -26,6 +26,7 @@ from thincam_jax.commands.sections import (
 from thincam_jax.hardware.acquisition.request import MONITOR, PlanRequest
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.cameras.features import BIT_DEPTHS
 from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.hardware.virtual.optics import MonitorPose
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
@@ -46,7 +47,7 @@ class DeviceConfig(Section):
 class CameraConfig(DeviceConfig, section(CameraSettings), section(Sensor, only=("pitch",))):
     """The camera and its settings; `pitch`: of its pixels."""
 
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
+    pixel_format: Literal[tuple(BIT_DEPTHS)] = "Mono12"  # pyright: ignore[reportInvalidTypeForm]
 
 
 class PhaseLevelsConfig(section(PhaseLevels)):
@@ -87,9 +88,13 @@ class AcquisitionConfig(section(Procedure, only=("exposure", "timeout", "retries
 
 
 class OpticsConfig(Section):
-    """The lensless camera; `distance`: from the modulator to the sensor, with the stage at 0."""
+    """The lensless camera; `distance`: from the modulator to the sensor, with the stage at 0.
 
-    wavelength: Wavelength
+    - `colours`: of a Bayer format, wavelengths of red, green and blue in place of `wavelength`.
+    """
+
+    wavelength: Wavelength | None = None
+    colours: tuple[Wavelength, Wavelength, Wavelength] | None = None
     distance: Length
     object: ObjectConfig
     model: Model = "separable"
@@ -169,12 +174,19 @@ class CaptureConfig(ExperimentConfig):
     def _rules(self) -> Iterator[tuple[Any, ...]]:
         """Whether each rule is broken, what is wrong then, and where; the first one counts."""
         kind, simulated, virtual = self.plan.kind, self.rig == "virtual", self.virtual
-        plan, given = self.plan.build(), {name for name, value in self if value}
-        yield from plan.rules(given, self.display.pitch, len(self.targets), simulated)
+        plan, camera = self.plan.build(), self.camera.build(CameraSettings)
+        given = {name for part in (self, self.optics or ()) for name, value in part if value}
+        yield from plan.rules(given, camera, self.display.pitch, len(self.targets), simulated)
         corrected = kind == "grey_levels" and self.display.options.get("grey_levels")
         yield corrected, "this plan measures it; drop it", "display", "options", "grey_levels"
         unpaired = (self.display.phase_levels is None) != (self.mask is None)
         yield unpaired, "and 'mask' belong together; give both", "display", "phase_levels"
+        yield (
+            self.mask and "colours" in given,
+            "a phase mask has one wavelength",
+            "optics",
+            "colours",
+        )
         yield simulated and virtual is None, "rig: virtual needs this section", "virtual"
         if simulated and virtual is not None:
             unseen = kind not in MONITOR and not self.targets

@@ -1,7 +1,7 @@
 """Reconstruction of a store of captures: an image or a system matrix, and a report."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,12 @@ from thincam_jax.commands.screen.run import build_cameras, build_plane, publishe
 from thincam_jax.commands.sections import PHASES, PictureConfig, SensorConfig, build_solver
 from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
-from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.measured import write_image
 from thincam_jax.measured.calibration import Alignment
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
+from thincam_jax.studies.evaluate import as_picture
 from thincam_jax.studies.pictures import PUBLISHED, beside, finding
 from thincam_jax.studies.rig import (
     FrameAgreement,
@@ -31,11 +31,11 @@ from thincam_jax.studies.rig import (
     align_display,
     calibrated,
     compare_frames,
-    frame_solver,
     monitor_system,
     reconstruct_pictures,
     recover_to,
 )
+from thincam_jax.studies.rig_images import frame_solver
 from thincam_jax.studies.study import Method, Study, Synthesis, Target
 
 _MATRIX = (
@@ -102,7 +102,35 @@ class _CaptureRun(Run):
         if self.agreement is not None:
             self.metrics["agreement"] = asdict(self.agreement)
             self.found = str(self.agreement)
-        self.complete(page(self.config, self.taken, self.agreement, self.table, self.found))
+        self.complete(self.page())
+
+    def page(self) -> Page:
+        config, taken, agreement, table = self.config, self.taken, self.agreement, self.table
+        beside_it = ", beside the scene and a direct simulation with other noise, and without"
+        images = f"What is reconstructed{beside_it if agreement else ''}."
+        seen = "What the sensor sees of single cells (row, column)"
+        seen += ": measured, and by direct simulation. " if agreement else ". "
+        exposures = ", ".join(f"{1000 * one:g}" for one in taken.exposures)
+        devices = "; ".join(f"{role} {driver}" for role, (driver, _) in config.drivers.items())
+        lead = (
+            f"Plan {config.plan.kind.replace('_', ' ')} on a {config.rig} rig: {devices}; exposure "
+            f"{exposures} ms.",
+            Picture("images.png", "Reconstructions", images),
+            Picture("columns.png", "Columns of the system matrix", seen + _MATRIX),
+            Picture("shown.png", "Patterns shown", "What the display showed."),
+            Picture("frames.png", "Frames taken", "What the camera took, without the dark frame."),
+        )
+        found = {} if agreement is None else asdict(agreement)
+        rows = [(name.replace("_", " "), str(value).strip("[]")) for name, value in found.items()]
+        explained = "Differences over the noise's standard deviation: 1 is agreement within it."
+        compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
+        parts = [compared] if rows else []
+        parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
+        if taken.seconds:
+            parts += [
+                Part("Time", (Picture("seconds.png", "Time of the steps", "Of all frames."),))
+            ]
+        return Page(lead, [*parts, Part("Notes", config.notes)], result=self.found)
 
     def show(self) -> None:
         taken, config, folder, seen = self.taken, self.config, self.folder, self.taken.seen
@@ -121,9 +149,9 @@ class _CaptureRun(Run):
     def reconstruct(self) -> None:
         seen, config = self.taken.seen, self.config
         study = build_study(config, (seen.frames.shape[1], seen.frames.shape[2]))
-        solve = frame_solver(study, study.config.object.width, seen.variance)
+        solve = frame_solver(study, study.config.object.width, seen.variance, seen.bayer)
         captured = solve(seen.frames)
-        images, scores = {"captured": np.squeeze(np.asarray(captured.image, float))}, {}
+        images, scores = {"captured": as_picture(np.asarray(captured.image, float))}, {}
         if seen.camera is not None and config.virtual is not None:
             whole = build_study(config, config.virtual.sensor)
             found = compare_frames(whole, seen, solve, captured, config.seed)
@@ -188,7 +216,7 @@ class _CaptureRun(Run):
 
 
 def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
-    """The cameras of a lensless plan, for frames of a shape, with the one method of its file.
+    """The cameras of a lensless plan, for frames of a shape, with the method of each colour.
 
     **Errors**: ConfigError for a picture that cannot be read.
     """
@@ -202,31 +230,33 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     betas, distances = np.broadcast_arrays(plan.betas or 0.0, distances)  # one of either
     width = plan.width if config.mask is None else config.mask.width
     assert width is not None
-    light = {"wavelength": optics.wavelength, "width": width}
-    exposures = Exposures(betas, distances, **light).at_phases(phases)
     solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
+    methods = []
+    for number, light in enumerate(optics.colours or (optics.wavelength,)):
+        shots = Exposures(betas, distances, wavelength=light or 0.0, width=width)
+        exposures = shots.at_phases(phases)
+        methods.append(Method(f"{number}", exposures, solver, synthesis, len(phases)))
 
-    def grey(entry: PictureConfig) -> Target:
-        """Of one light: colours are averaged."""
-        seen, shown = optics.object, picture(entry, config.cells if monitor else None)
-        target = Target.of_image(entry.name, shown, seen.distance, seen.width, entry.kind)
-        image = target.plane.image.mean(axis=0)
-        return replace(target, plane=ImagePlane(image, target.distance, target.width))
+    def target(entry: PictureConfig) -> Target:
+        """Of one light, colours are averaged."""
+        seen, cells = optics.object, config.cells if monitor else None
+        shown = picture(entry, cells, 3 if optics.colours else 0)
+        return Target.of_image(entry.name, shown, seen.distance, seen.width, entry.kind)
 
     pixels = {"pixel_pitch": display.pitch, "fill_factor": display.fill_factor}
     given = {"width": plan.width, "profile": plan.profile} | ({} if monitor else pixels)
     mask = MaskConfig.model_construct(**given)
     sensor = SensorConfig.model_construct(shape=shape, pitch=config.camera.pitch)
     if display.phase_levels is None:
-        built = build_optics(mask, sensor, exposures[0])
+        built = build_optics(mask, sensor, methods[0].exposures[0])
     else:
         (levels,) = picture_levels(config).values()
         seen = display.pitch, optics.wavelength, display.fill_factor
         built = display.phase_levels.build().mask(levels, *seen), sensor.build()
     return Study(
         *built,
-        (Method(plan.kind, exposures, solver, synthesis, len(phases)),),
-        tuple(config.read_all("targets", grey)),
+        tuple(methods),
+        tuple(config.read_all("targets", target)),
         object_distance=optics.object.distance,
         model=optics.model,
         pixel_integration=optics.pixel_integration,
@@ -270,36 +300,3 @@ def screen_system(config: CaptureConfig) -> Sparse:
     except ValueError as error:
         place = config.place_of("virtual", "screen")
         raise ConfigError(f"{place}virtual.screen: {error}") from None
-
-
-def page(
-    config: CaptureConfig,
-    taken: Taken,
-    agreement: FrameAgreement | MatrixAgreement | None,
-    table: Table | None,
-    result: str,
-) -> Page:
-    """The page of a finished run; `result`: in a sentence."""
-    beside_it = ", beside the scene and a direct simulation with other noise, and without"
-    images = f"What is reconstructed{beside_it if agreement else ''}."
-    seen = "What the sensor sees of single cells (row, column)"
-    seen += ": measured, and by direct simulation. " if agreement else ". "
-    exposures = ", ".join(f"{1000 * one:g}" for one in taken.exposures)
-    devices = "; ".join(f"{role} {driver}" for role, (driver, _) in config.drivers.items())
-    lead = (
-        f"Plan {config.plan.kind.replace('_', ' ')} on a {config.rig} rig: {devices}; exposure "
-        f"{exposures} ms.",
-        Picture("images.png", "Reconstructions", images),
-        Picture("columns.png", "Columns of the system matrix", seen + _MATRIX),
-        Picture("shown.png", "Patterns shown", "What the display showed."),
-        Picture("frames.png", "Frames taken", "What the camera took, without the dark frame."),
-    )
-    found = {} if agreement is None else asdict(agreement)
-    rows = [(name.replace("_", " "), str(value).strip("[]")) for name, value in found.items()]
-    explained = "Differences over the noise's standard deviation: 1 is agreement within it."
-    compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
-    parts = [compared] if rows else []
-    parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
-    if taken.seconds:
-        parts += [Part("Time", (Picture("seconds.png", "Time of the steps", "Of all frames."),))]
-    return Page(lead, [*parts, Part("Notes", config.notes)], result=result)

@@ -113,11 +113,17 @@ class PlanRequest:
         return matrix or self.kind == "hadamard" or (self.kind == "pictures" and not optics)
 
     def rules(
-        self, given: set[str], pitch: float | None, targets: int, simulated: bool
+        self,
+        given: set[str],
+        camera: CameraSettings,
+        pitch: float | None,
+        targets: int,
+        simulated: bool,
     ) -> Iterator[tuple[Any, ...]]:
         """Whether each rule of a file is broken, what is wrong then, and where.
 
-        - `given`: names of the sections that the file has. `pitch`: of its display.
+        - `given`: names of the sections that the file has, and of the keys of its optics. `pitch`:
+          of its display.
         """
         name, kind = self.kind, f"a plan of kind {self.kind}"
         named = "optics", "matrix", "alignment", "mask"
@@ -135,6 +141,14 @@ class PlanRequest:
         yield unfit, f"{kind} {'takes no' if by_cells else 'needs'} optics", "optics"
         yield pictures and not (optics or matrix), f"{kind} needs it", "matrix"
         yield matrix and not pictures and name != "scene", f"{kind} takes none; drop it", "matrix"
+        coloured = camera.bayer is not None
+        grey = f"{kind}{' with a matrix' if matrix else ''} takes one colour; give a Mono format"
+        yield coloured and (matrix or name in MONITOR), grey, "camera", "pixel_format"
+        light = "a wavelength and no colours"
+        light = "colours: [red, green, blue] and no wavelength" if coloured else light
+        for key, wanted in (("colours", coloured), ("wavelength", not coloured)):
+            wrong = optics and (key in given) != wanted
+            yield wrong, f"{camera.pixel_format} takes {light}", "optics", key
         yield pictures and optics and not aligned, f"{kind} with optics needs it", "alignment"
         yield aligned and not (pictures and optics), f"{kind} takes none; drop it", "alignment"
         yield pictures and not targets, f"{kind} needs them; give one", "targets"

@@ -1,6 +1,7 @@
 """Optics of a virtual camera: a scene through a light modulator, or a monitor's cells."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
 
@@ -28,6 +29,7 @@ from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.measured.bayer import Pattern, mosaic
 from thincam_jax.measured.calibration.alignment import to_indices
 
 _TERMS = 4  # singular terms of a pattern that are averaged exactly
@@ -110,6 +112,27 @@ class ModulatorOptics:
             convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)
             image = image + np.asarray(convolution(project(camera, plane, shape)))
         return (self.electrons * image).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicOptics:
+    """Light on a colour sensor, whose pixels each see red, green or blue alone.
+
+    - `colours`: light on the whole sensor of each of these.
+    - `pattern`: Bayer pattern of the whole sensor.
+    """
+
+    colours: Sequence[Optics]
+    pattern: Pattern
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        return self.colours[0].sensor_shape
+
+    def __call__(
+        self, shown: UInt8[np.ndarray, "v u"], position: float
+    ) -> Float[np.ndarray, "y x"]:
+        return mosaic(np.stack([one(shown, position) for one in self.colours]), self.pattern)
 
 
 def _middle(shown: np.ndarray) -> np.ndarray:

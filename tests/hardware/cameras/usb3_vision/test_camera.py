@@ -72,8 +72,8 @@ def test_settings_move_to_the_nearest(camera):
         (CameraSettings(0.01, Region(0, 0, 49, 64)), "a part of 48 × 64"),
         (CameraSettings(0.01, Region(0, 0, 4, 64)), "Height of 4 pixels; give at least 16"),
         (
-            CameraSettings(0.01, pixel_format="BayerGB8"),
-            "no pixel format BayerGB8; give one of Mono8, Mono10",
+            CameraSettings(0.01, pixel_format="BayerGB10"),
+            "no pixel format BayerGB10; give one of Mono8, Mono10",
         ),
         (CameraSettings(0.01, binning=2), "BinningHorizontal of 2; give 1 … 1"),
         (CameraSettings(0.01, black_level=60.0), "BlackLevel of 60; give 0 … 0"),
