@@ -271,7 +271,7 @@ def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
     """
     if config.mask is not None:
         table, light, pitch = config.display.phase_levels, config.optics, config.display.pitch
-        assert table is not None and light is not None
+        assert table is not None and light is not None and light.wavelength is not None
         exposure = Exposure(0.0, 0.0, light.distance, light.wavelength, config.mask.width)
         try:
             shown = built_mask(config.mask, exposure), pitch, light.wavelength
