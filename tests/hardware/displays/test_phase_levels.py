@@ -72,3 +72,5 @@ def test_a_file_holds_the_table(tmp_path):
         path.write_text(json.dumps(content))
         with pytest.raises(ValueError, match=r"slm\.json holds no table of phases"):
             PhaseLevels.read(path)
+    with pytest.raises(ValueError, match=r"none\.json holds no table of phases: .*No such file"):
+        PhaseLevels.read("none.json")

@@ -47,7 +47,7 @@ class PhaseLevels:
         try:
             content = json.loads(read_regular(path))
             return cls(**{**content, "phases": tuple(content["phases"])})
-        except (ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} holds no table of phases: {error}") from error
 
     def at(self, wavelength: float) -> np.ndarray:
