@@ -21,6 +21,7 @@ from thincam_jax.hardware.base import Frame as Frame
 from thincam_jax.hardware.base import Identity as Identity
 from thincam_jax.hardware.base import Region as Region
 from thincam_jax.hardware.base import Stage as Stage
+from thincam_jax.hardware.displays.phase_levels import PhaseLevels as PhaseLevels
 from thincam_jax.hardware.errors import Busy as Busy
 from thincam_jax.hardware.errors import Disconnected as Disconnected
 from thincam_jax.hardware.errors import HardwareError as HardwareError

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from thincam_jax._core import checks
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.quantity import check_fields, quantity
+from thincam_jax._core.quantity import FieldError, check_fields, quantity
 from thincam_jax.hardware.displays.grey_levels import LEVELS
 from thincam_jax.lensless.masks import AbstractMask, SampledMask
 
@@ -25,6 +25,19 @@ class PhaseLevels:
     - `wavelength`: at which they were measured, mm.
     - `tolerance`: width of the interval about a phase in which a level has to lie, rad.
     - `gap`: amplitude of the dead space between pixels over theirs, of phase 0: zero order.
+
+    **Errors**: ValueError for one phase, or more than there are levels.
+
+    ```python
+    import numpy as np
+    from thincam_jax.hardware import PhaseLevels
+    from thincam_jax.units import nm
+
+    table = PhaseLevels(np.linspace(0, 6.2, 17), 532 * nm)
+    print(table.levels(np.array([[0.0, 3.1]]), 532 * nm))  # [[  0 128]]
+    ```
+
+    **See also**: `open_rig`.
     """
 
     phases: Annotated[tuple[float, ...], quantity("rad", many=True)]
@@ -35,7 +48,8 @@ class PhaseLevels:
     def __post_init__(self):
         check_fields(self)
         if not 2 <= len(self.phases) <= LEVELS:
-            raise ValueError(f"{len(self.phases)} phases; give 2 to {LEVELS}, from level 0 to 255")
+            given = f"{len(self.phases)} phases; give 2 to {LEVELS}, from level 0 to 255"
+            raise FieldError(given, "phases")
 
     def write(self, path: str | PathLike[str]) -> None:
         """Write the table as a JSON file."""
