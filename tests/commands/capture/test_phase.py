@@ -88,7 +88,7 @@ def test_phases_of_files(file, tmp_path):
     [
         ("mask=null", "plan.width: optics need betas and width of the mask; give them"),
         ("display.phase_levels=null", "display.phase_levels: and 'mask' belong together"),
-        ("display.phase_levels.phases=[1 rad]", "display.phase_levels.phases: 1 phases; give 2 to 256"),
+        ("display.phase_levels.phases=[1 rad]", "phase_levels.phases: 1 phases; give 2 to 256"),
         ("display.phase_levels=none.json", "none.json"),
         ("plan.betas=[60 rad/mm^2]", "mask: is of a scene or psf_stack with optics and without"),
         ("plan={kind: fringe_scan}", "plan.betas: a plan of kind fringe_scan needs it"),
