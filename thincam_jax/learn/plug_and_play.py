@@ -8,9 +8,9 @@ Half-quadratic splitting (Zhang et al., DPIR, IEEE Trans. Pattern Anal. 44, 6360
 with w = 1/variance and a deviation s of the prior that falls from step to step. With
 :math:`M = A^T w A + s^{-2}` the noise of z has the covariance :math:`M^{-1} A^T w A M^{-1}`: a mode
 that the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at
-most s/2. σ is the largest of a ring of frequencies, since a denoiser sees a neighbourhood, or s/2
-where the modes are not frequencies. A last data step, with s/4, gives back what the denoiser took
-from modes that the captures know well.
+most s/2. σ is the largest of a ring of frequencies, since a denoiser sees a neighbourhood; s/2 for
+several planes, and where the modes are not frequencies. A last data step, with s/4, gives back what
+the denoiser took from modes that the captures know well.
 """
 
 import dataclasses
@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.precision import squared_modulus
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
@@ -66,7 +65,7 @@ _FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 12
 # Width of the rings, cycles per pixel. Half of it is s/2 for most cameras; with twice as much, or
 # the mean of all modes, noise in a band is not removed (methods A and B lose up to 3 dB).
 _RING = 1 / 64
-# Of s, since what f has wrong stays in z. Without it two planes lose 0.4 dB at 100 electrons.
+# Of s, since what f has wrong stays in z. Without it a dark room loses 0.1 dB at 100 electrons.
 _LEAST_NOISE = 0.4
 # Of s in the last data step. It gains a FlatCam up to 5 dB.
 _FINAL = 0.25
@@ -281,15 +280,17 @@ class _Run:
 @eqx.filter_jit
 def largest_noise(
     normal: AbstractNormal, shift: Float[Array, ""], precision: Float[Array, ""]
-) -> Float[Array, "channel plane"] | Float[Array, ""]:
-    """σ of z: the largest of a ring of frequencies, from 0.4 s; s/2 where modes are other ones."""
+) -> Float[Array, "channel 1"] | Float[Array, ""]:
+    """σ of z: the largest of a ring of frequencies, from 0.4 s; s/2 where modes are other ones.
+
+    And of several planes, where errors of one are in the others.
+    """
     s, operators = 1 / jnp.sqrt(shift * precision), convolutions(normal.problem)
-    if operators is None or not isinstance(normal, IterativeNormal):
+    planes = normal.problem.image_shape[-3]
+    if operators is None or planes > 1 or not isinstance(normal, IterativeNormal):
         return s / 2
-    inverse = dataclasses.replace(normal, shift=shift).inverse_filter(operators)
-    # The diagonal of M⁻¹ AᵀwA M⁻¹ = M⁻¹ − μ M⁻².
-    own = jnp.diagonal(inverse, axis1=1, axis2=2).real
-    power = jnp.moveaxis(own, -1, 1) - shift * jnp.sum(squared_modulus(inverse), axis=2)
+    inverse = dataclasses.replace(normal, shift=shift).inverse_filter(operators)[:, 0].real
+    power = inverse - shift * inverse**2  # M⁻¹ AᵀwA M⁻¹ = M⁻¹ − μ M⁻²
     rows, columns = operators[0].window
     radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns))
     ring = np.ravel(radius / _RING).astype(int)
