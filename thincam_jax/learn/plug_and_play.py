@@ -246,15 +246,15 @@ class _Run:
         if not bool(jnp.isfinite(found).all()):
             self.misfit = math.nan
             return
-        sigma = solver.strength.astype(found.dtype) * largest_noise(
-            self.normal, shift, self.precision
-        )
-        image = solver.denoiser(found, jnp.broadcast_to(sigma, found.shape[:-2]))
-        image = jnp.maximum(image, 0) if solver.nonnegative else image
-        chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
         if number == 0:
             mistake = noise_mistake(self.normal, found, shift, self.precision)
             self.precision = self.precision / mistake**2
+        noise = largest_noise(self.normal, shift, self.precision)
+        sigma = jnp.broadcast_to(solver.strength.astype(noise.dtype) * noise, found.shape[:-2])
+        image = solver.denoiser(found, sigma)
+        image = jnp.maximum(image, 0) if solver.nonnegative else image
+        chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
+        if number == 0:
             self.largest = or_one(_FIRST * brightness(image))
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
