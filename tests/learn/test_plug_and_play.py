@@ -95,6 +95,19 @@ def test_noise_that_was_told_wrongly_is_found():
         assert abs(ratio / wrong - 1) < 0.2
 
 
+def test_the_first_image_is_denoised_with_the_noise_that_was_found():
+    """Told half of it, the first data step leaves twice the noise that it would say."""
+    first = {}
+    for told in (SIGMA, SIGMA / 2):
+
+        def watched(image, sigma, told=told):
+            first.setdefault(told, float(jnp.ravel(sigma)[0]))
+            return image
+
+        tc.reconstruct(recording(told=told), tc.PlugAndPlay(watched, iterations=1))
+    assert abs(first[SIGMA / 2] / first[SIGMA] / 2 - 1) < 0.2
+
+
 def test_the_noise_is_that_of_the_noisiest_part():
     """Shot noise is three times as strong in the middle; the mean would say 1.4."""
     rng = np.random.default_rng(4)
