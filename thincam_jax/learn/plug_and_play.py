@@ -62,8 +62,8 @@ from thincam_jax.reconstruction.total_variation import TotalVariation
 # s falls from twice the brightness of the image to a 24th of it; given a start, from a twelfth of
 # that. From once the brightness dark images at 20 dB stay 1.5 dB below.
 _FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 12
-# Width of the rings, cycles per pixel. Half of it is s/2 for most cameras; with twice as much, or
-# the mean of all modes, noise in a band is not removed (methods A and B lose up to 3 dB).
+# Width of the rings, cycles per pixel. Narrower ones gain less. Wider ones leave noise in a band:
+# method A loses 0.3 dB of a photograph with rings four times as wide, 3 dB with the mean of all.
 _RING = 1 / 64
 # Of s, since what f has wrong stays in z. Without it a dark room loses 0.1 dB at 100 electrons.
 _LEAST_NOISE = 0.4
@@ -281,9 +281,10 @@ class _Run:
 def largest_noise(
     normal: AbstractNormal, shift: Float[Array, ""], precision: Float[Array, ""]
 ) -> Float[Array, "channel 1"] | Float[Array, ""]:
-    """σ of z: the largest of a ring of frequencies, from 0.4 s; s/2 where modes are other ones.
+    """σ of z: the largest deviation of a ring of frequencies, at least 0.4 s.
 
-    And of several planes, where errors of one are in the others.
+    s/2 where the modes are not frequencies, and of several planes, since each has the others'
+    errors.
     """
     s, operators = 1 / jnp.sqrt(shift * precision), convolutions(normal.problem)
     planes = normal.problem.image_shape[-3]

@@ -424,7 +424,7 @@ def or_one(value: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @jax.jit
 def brightness(image: Float[Array, "..."]) -> Float[Array, ""]:
-    """Brightness of what is bright, Σ f³/Σ f² over f > 0: dark surroundings do not count."""
+    """Mean of f weighted by f², Σ f³/Σ f² over f > 0, in which dark surroundings do not count."""
     bright = jnp.maximum(image, 0)
     return jnp.sum(bright**3) / or_one(jnp.sum(bright**2))
 

@@ -243,8 +243,9 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
         study = build_study(config, virtual.sensor)
         light: Any = display.pitch, optics.distance, virtual.electrons, display.fill_factor
         if display.phase_levels is not None:
-            (levels,) = picture_levels(config).values()
-            light += (virtual.phase_levels or display.phase_levels).build(), levels.shape
+            pixels: Any = study.mask
+            table = virtual.phase_levels or display.phase_levels
+            light += table.build(), pixels.amplitude.shape
         parts = [ModulatorOptics(one, study.sensor, *light) for one in scenes_of(study)]
         pattern = config.camera.build(CameraSettings, region=None).bayer
         seen = parts[0] if pattern is None else MosaicOptics(parts, pattern)
