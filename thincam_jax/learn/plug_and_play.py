@@ -108,6 +108,8 @@ class PlugAndPlay(AbstractIterativeSolver):
     Nothing is to be tuned. The noise is taken as the recording tells, corrected by up to four times
     where the residual of the first data step is another. Each image, colour and plane is denoised
     by itself. Several planes, and fields larger than the captures, begin with an image by `AdmmTV`.
+    Steps before the last add noise, the same in each call, where the images of convolutions have
+    little of it.
     What the denoiser has not learned, such as fine texture, may be lost, and what looks like an
     edge be made up.
 
