@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.precision import as_complex
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax._core.random import Key
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
@@ -315,9 +316,13 @@ def with_noise(
     means = sums / np.bincount(ring).astype(power.dtype)
     sigma = jnp.maximum(jnp.sqrt(jnp.max(means, axis=-1)), _LEAST_NOISE * s)
     lacking = jnp.maximum(share * sigma[..., None, None] ** 2 - power, 0)
-    white = jnp.fft.rfft2(jax.random.normal(key, (*image.shape[:-2], *window), image.dtype))
-    noise = jnp.fft.irfft2(jnp.sqrt(lacking).astype(white.dtype) * white, s=window)
-    return image + noise[..., : image.shape[-2], : image.shape[-1]], sigma
+
+    def with_more():
+        white = jax.random.normal(key, (*image.shape[:-2], *window), image.dtype)
+        noise = jnp.fft.irfft2(as_complex(jnp.sqrt(lacking)) * jnp.fft.rfft2(white), s=window)
+        return image + noise[..., : image.shape[-2], : image.shape[-1]]
+
+    return jax.lax.cond(share > 0, with_more, lambda: image), sigma
 
 
 def _is_slow(problem: InverseProblem) -> bool:
