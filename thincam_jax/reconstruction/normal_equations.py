@@ -20,10 +20,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
+import numpy as np
 import optimistix
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
+from thincam_jax._core.grids import fast_shape
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax.imaging.operators import (
     AbstractOperator,
@@ -47,6 +49,8 @@ from thincam_jax.reconstruction.problem import (
 # Of conjugate gradients within an iteration, relative to the right-hand side.
 INNER_TOLERANCE = {"float32": 1e-5, "float64": 1e-10}
 INNER_STEPS = 500
+# In units of the machine's, of the eigenvalues of convolutions, relative to the largest.
+_ROUNDING = 10
 
 
 class AbstractNormal(eqx.Module):
@@ -109,7 +113,9 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
         if bare[0].terms == 1 and fixed.weights[0].size == 1:
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
-    return IterativeNormal(problem, shift)
+    convolved = convolutions(fixed)
+    powers = None if convolved is None else mean_powers(convolved, fixed.weights)
+    return IterativeNormal(problem, shift, powers=powers)
 
 
 class DenseNormal(AbstractNormal):
@@ -190,10 +196,11 @@ class InverseNormal(AbstractNormal):
 class IterativeNormal(AbstractNormal):
     """By conjugate gradients to `INNER_TOLERANCE`.
 
-    Convolutions are preconditioned, and separable cameras by the `modes` that are given.
+    Convolutions are preconditioned by their `mean_powers`, separable cameras by the `modes` given.
     """
 
     modes: SeparableModes | None = None
+    powers: Complex[Array, "channel p q v u"] | None = None
 
     def solve(self, right: Float[Array, "..."]):
         return self(right, jnp.zeros_like(right))
@@ -218,9 +225,9 @@ class IterativeNormal(AbstractNormal):
             lambda image: factor * self.applied(image), structure, tags
         )
         options: dict[str, Any] = {"y0": guess / factor}
-        operators, filtered = convolutions(self.problem), None
-        if operators is not None:
-            filtered = functools.partial(_uncropped, operators[0], self.inverse_filter(operators))
+        filtered = None
+        if self.powers is not None:
+            filtered = functools.partial(_filtered, self.inverse_filter())
         elif self.modes is not None:
             filtered = functools.partial(_by_modes, self.modes, self.shift)
         if filtered is not None:
@@ -231,32 +238,76 @@ class IterativeNormal(AbstractNormal):
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
-    def inverse_filter(
-        self, operators: Sequence[CropConvolution]
-    ) -> Complex[Array, "channel p q v u"]:
-        """(Σ w̄ ĥ_p* ĥ_q + μ)⁻¹ of the planes p, q at each frequency of the window."""
-        parts = [
-            as_complex(jnp.mean(w)) * o.spectrum[:, :, None].conj() * o.spectrum[:, None]
-            for o, w in zip(operators, self.problem.weights, strict=True)
-        ]
-        matrix = sum(parts[1:], start=parts[0])
-        count, shift = matrix.shape[1], self.shift.astype(matrix.dtype)
+    def inverse_filter(self) -> Complex[Array, "channel p q v u"]:
+        """(AᵀwA + μ)⁻¹ of the planes p, q at each frequency of a convolution's field."""
+        assert self.powers is not None
+        count, shift = self.powers.shape[1], self.shift.astype(self.powers.dtype)
         if count == 1:
-            return 1 / (matrix + shift)
-        matrix = jnp.moveaxis(matrix, (1, 2), (-2, -1))
+            return 1 / (self.powers + shift)
+        matrix = jnp.moveaxis(self.powers, (1, 2), (-2, -1))
         inverse = jnp.linalg.inv(matrix + shift * jnp.eye(count, dtype=matrix.dtype))
         return jnp.moveaxis(inverse, (-2, -1), (1, 2))
 
 
-def _uncropped(operator: CropConvolution, inverse, image: Float[Array, "..."]):
-    """The inverse on the window, and cut: the inverse without the crop.
+def _filtered(inverse: Complex[Array, "channel p q v u"], image: Float[Array, "..."]):
+    """An image on the window of the filter, filtered, and cut: positive definite."""
+    rows, columns = image.shape[-2:]
+    window = padded_field((rows, columns))
+    field = jnp.fft.rfft2(place(image, (0, 0), window))
+    field = jnp.fft.irfft2(jnp.sum(inverse * field[..., None, :, :, :], axis=-3), s=window)
+    return cut(field, (0, 0), (rows, columns))
 
-    Positive definite, since it is a positive filter between a map and its transpose.
+
+def padded_field(shape: tuple[int, int]) -> tuple[int, int]:
+    """The window of a field's filters."""
+    return fast_shape(shape, real=True)
+
+
+@jax.jit
+def mean_powers(
+    operators: Sequence[CropConvolution], weights: Sequence[Float[Array, "..."]]
+) -> Complex[Array, "channel p q v u"]:
+    r"""Eigenvalues of the circulant matrix nearest to Σ AᵀwA, at the frequencies of the field.
+
+    AᵀA of a pixel and another at a lag l, averaged over the field, is the correlation of the PSFs,
+    each point weighted by the part of the field from which it falls on the sensor, times the part
+    of the field that has both pixels (T. Chan, SIAM J. Sci. Stat. Comput. 9, 766, 1988). All are
+    positive, since so are the spectra that are multiplied and averaged.
     """
-    field = jnp.fft.rfft2(place(image, operator.field_corner, operator.window))
-    filtered = jnp.sum(inverse * field[..., None, :, :, :], axis=-3)
-    field = jnp.fft.irfft2(filtered, s=operator.window)
-    return cut(field, operator.field_corner, operator.field_shape)
+    window, field = operators[0].window, operators[0].field_shape
+    parts = []
+    for o, w in zip(operators, weights, strict=True):
+        sides = zip(o.sensor_shape, field, window, o.sensor_corner, o.field_corner, strict=True)
+        rows, columns = (np.sqrt(_seen(*side)).astype(w.dtype) for side in sides)
+        kernel = jnp.fft.irfft2(o.spectrum, s=window) * rows[:, None] * columns
+        spectrum = jnp.fft.rfft2(kernel)
+        both = spectrum[:, :, None].conj() * spectrum[:, None]
+        parts.append(as_complex(jnp.mean(w)) * both)
+    folded = jnp.fft.irfft2(sum(parts[1:], start=parts[0]), s=window)
+    for axis, side, period in zip((-2, -1), field, padded_field(field), strict=True):
+        folded = _folded(jnp.moveaxis(folded, axis, -1), side, period)
+        folded = jnp.moveaxis(folded, -1, axis)
+    powers = jnp.fft.rfft2(folded)
+    # Rounding must not make one negative.
+    least = _ROUNDING * jnp.finfo(folded.dtype).eps * jnp.max(jnp.abs(powers))
+    unit = jnp.eye(powers.shape[1], dtype=folded.dtype)[..., None, None]
+    return powers + as_complex(least * unit)
+
+
+def _folded(lags: Float[Array, "*planes n"], side: int, period: int) -> Float[Array, "*planes m"]:
+    """Lags of a line of pixels on a circle, each times the part of the line that has both."""
+    shared = ((side - np.arange(side)) / side).astype(lags.dtype)
+    circle = jnp.zeros((*lags.shape[:-1], period), lags.dtype)
+    circle = circle.at[..., :side].add(shared * lags[..., :side])
+    return circle.at[..., period - side + 1 :].add(shared[:0:-1] * lags[..., 1 - side :])
+
+
+def _seen(sensor: int, field: int, window: int, start: int, begin: int) -> np.ndarray:
+    """Part of a field's samples that send light to the sensor, for each sample of a PSF."""
+    least = 1 - field - (window - (sensor + field - 1)) // 2
+    lag = (np.arange(window) - (start - begin) - least) % window + least
+    both = np.minimum(min(sensor, field), np.minimum(lag + field, sensor - lag))
+    return np.clip(both, 0, None) / field
 
 
 def _weighted(problem: InverseProblem):
