@@ -9,10 +9,9 @@ with w = 1/variance and a deviation s of the prior that falls from step to step.
 :math:`M = A^T w A + s^{-2}` the noise of z has the covariance :math:`M^{-1} A^T w A M^{-1}`: a mode
 that the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at
 most s/2. σ is the largest of a ring of frequencies, since a denoiser sees a neighbourhood; s/2 for
-several planes, and where the modes are not frequencies. The denoiser knows white noise only, and
-where most modes hold less it takes fine detail for noise: in the first steps, frequencies with less
-than half of σ² are given more. A last data step, with s/4, gives back what the denoiser took from
-modes that the captures know well.
+several planes, and where the modes are not frequencies. The shipped denoiser was trained inside
+these steps, behind other cameras (`ReconstructionLessons`). A last data step, with s/4, gives back
+what the denoiser took from modes that the captures know well.
 """
 
 import dataclasses
@@ -27,9 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.precision import as_complex
 from thincam_jax._core.quantity import quantity, whole
-from thincam_jax._core.random import Key
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
 from thincam_jax.reconstruction.methods import AdmmTV, starts_uniform
@@ -39,6 +36,7 @@ from thincam_jax.reconstruction.normal_equations import (
     DenseNormal,
     IterativeNormal,
     normal_equations,
+    padded_field,
 )
 from thincam_jax.reconstruction.parallel import independent_parts
 from thincam_jax.reconstruction.problem import (
@@ -71,20 +69,22 @@ _FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 12
 _RING = 1 / 64
 # Of s, since what f has wrong stays in z. Without it a dark room loses 0.1 dB at 100 electrons.
 _LEAST_NOISE = 0.4
-# Of σ²: the power to which noise is added, in the first part of the steps. In all of them it looks
-# sharper still, but costs a well-conditioned camera at 40 dB 0.2 dB.
-_FILLED, _FILLING = 0.5, 0.625
+STEPS = 5  # in which the shipped denoiser was trained
 # Of s in the last data step. It gains a FlatCam up to 5 dB.
-_FINAL = 0.25
-# Part of its value to which s falls with each further step, and χ² of a pixel that ends them: three
-# times the noise. They halve the residual of bright captures, and gain no more below.
-_FALL, _EXPLAINED = 0.58, 10
+FINAL = 0.25
+# Part of its value to which s falls with each further step, how many there are, and χ² of a pixel
+# that ends them: three times the noise. They halve the residual of bright captures, and gain no
+# more below.
+_FALL, _FURTHER, _EXPLAINED = 0.58, 8, 10
 # Weight and iterations of the image by total variation from which several planes begin, and fields
 # with more pixels than the captures: what captures hardly show takes too many data steps. It gains
 # planes up to 0.9 dB; a dark room at 40 dB up to 15 dB.
 _TAU, _ITERATIONS = 1.0, 100
 # Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
 _STEP_ERROR = 0.03
+# Of the normal equations, in units of the precision's rounding, ‖A‖ being 1: with less, as of
+# captures with over 45 dB in single precision, they are not solved, and images explode.
+_LEAST_SHIFT = 64
 _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
 _LEAST_SHARE = 0.02  # of the noise, that the first data step leaves, by which it can be found
 _PARTS, _SMALLEST = 3, 8  # along each side of a capture, and the pixels that such a part has
@@ -109,8 +109,6 @@ class PlugAndPlay(AbstractIterativeSolver):
     Nothing is to be tuned. The noise is taken as the recording tells, corrected by up to four times
     where the residual of the first data step is another. Each image, colour and plane is denoised
     by itself. Several planes, and fields larger than the captures, begin with an image by `AdmmTV`.
-    Steps before the last add noise, the same in each call, where the images of convolutions have
-    little of it.
     What the denoiser has not learned, such as fine texture, may be lost, and what looks like an
     edge be made up.
 
@@ -121,7 +119,7 @@ class PlugAndPlay(AbstractIterativeSolver):
     - `strength`: σ relative to the one found; more gives smoother images, less leaves noise.
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: as of `AdmmTV`.
-    - `iterations`: data steps after the first one, in which s falls. Up to as many more follow
+    - `iterations`: data steps after the first one, in which s falls. Up to eight more follow
       where the residual is still over three times the noise, as of very bright captures.
     - `tolerance`: change in the last one, relative to an image's length, that counts as converged.
 
@@ -146,7 +144,7 @@ class PlugAndPlay(AbstractIterativeSolver):
     )
     nonnegative: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
     synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
-    iterations: int = eqx.field(default=8, converter=whole(1), static=True, kw_only=True)
+    iterations: int = eqx.field(default=STEPS, converter=whole(1), static=True, kw_only=True)
     tolerance: float = eqx.field(default=3e-3, converter=as_tolerance, static=True, kw_only=True)
 
     def solve(
@@ -184,7 +182,7 @@ class PlugAndPlay(AbstractIterativeSolver):
             for part, image in zip(parts, images, strict=True):
                 like = runs[0].normal if runs else None
                 runs.append(_Run(self, part, image, like, warm=start is not None))
-            for number in range(2 * self.iterations + 1):
+            for number in range(self.iterations + _FURTHER + 1):
                 for run in runs:
                     run.advance(number)
                 images = [run.result for run in runs]
@@ -237,7 +235,7 @@ class _Run:
         level = uniform_image(problem) / self.unit
         seen = brightness(self.image) if warm else jnp.max(level)
         self.s = self.largest = or_one(_FIRST * seen) * (_WARM if warm else 1)
-        self.warm = warm
+        self.course = course(solver.iterations, _WARM if warm else 1.0)
         self.misfit = self.gap = self.change = math.nan
 
     def advance(self, number: int) -> None:
@@ -248,9 +246,7 @@ class _Run:
                 return
             self.s = self.s * _FALL
         elif number:
-            begin = _WARM if self.warm else 1.0
-            part = (number - 1) / max(solver.iterations - 1, 1)
-            self.s = self.largest * begin * (_LAST / begin) ** part
+            self.s = self.largest * self.course[number - 1]
         shift, found = self._data_step(self.s)
         if not bool(jnp.isfinite(found).all()):
             self.misfit = math.nan
@@ -258,15 +254,13 @@ class _Run:
         if number == 0:
             mistake = noise_mistake(self.normal, found, shift, self.precision)
             self.precision = self.precision / mistake**2
-        share = jnp.asarray(_FILLED if number <= _FILLING * solver.iterations else 0.0, found.dtype)
-        key = jax.random.key(number)
-        noisy, noise = with_noise(self.normal, found, shift, self.precision, share, key)
+        noise = largest_noise(self.normal, shift, self.precision)
         sigma = jnp.broadcast_to(solver.strength.astype(noise.dtype) * noise, found.shape[:-2])
-        image = solver.denoiser(noisy, sigma)
+        image = solver.denoiser(found, sigma)
         image = jnp.maximum(image, 0) if solver.nonnegative else image
         chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
         if number == 0:
-            self.largest = or_one(_FIRST * brightness(image))
+            self.largest = largest_deviation(image)
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
             self.image, self.result = image, image * self.unit
@@ -278,51 +272,49 @@ class _Run:
 
     def finished(self) -> Image:
         """The image after one more data step."""
-        _, image = self._data_step(self.s * _FINAL)
+        _, image = self._data_step(self.s * FINAL)
         image = jnp.maximum(image, 0) if self.solver.nonnegative else image
         return jnp.where(jnp.isfinite(image).all(), image * self.unit, self.result)
 
     def _data_step(self, s: Float[Array, ""]):
         """The shift of the normal equations, and z."""
-        shift = 1 / (s**2 * self.precision)
-        return shift, _data_step(self.normal, self.right, self.image, shift, self.precision)
+        least = _LEAST_SHIFT * jnp.finfo(self.image.dtype).eps
+        shift = jnp.maximum(1 / (s**2 * self.precision), least)
+        return shift, data_step(self.normal, self.right, self.image, shift, self.precision)
+
+
+def largest_deviation(image: Image) -> Float[Array, ""]:
+    """s of a first step."""
+    return or_one(_FIRST * brightness(image))
+
+
+def course(steps: int, begin: float = 1.0) -> list[float]:
+    """s of the steps after the first, relative to its own."""
+    return np.geomspace(begin, _LAST, steps).tolist()
 
 
 @eqx.filter_jit
-def with_noise(
-    normal: AbstractNormal,
-    image: Image,
-    shift: Float[Array, ""],
-    precision: Float[Array, ""],
-    share: Float[Array, ""],
-    key: Key,
-) -> tuple[Image, Float[Array, "channel 1"] | Float[Array, ""]]:
-    """z as the denoiser gets it, and its σ: the largest of a ring of frequencies, at least 0.4 s.
+def largest_noise(
+    normal: AbstractNormal, shift: Float[Array, ""], precision: Float[Array, ""]
+) -> Float[Array, "channel 1"] | Float[Array, ""]:
+    """The noise of z that a denoiser is told: the largest of a ring of frequencies, at least 0.4 s.
 
-    Frequencies with less than a share of σ² have Gaussian noise added up to that. Where the modes
-    are not frequencies, and of several planes, since each has the others' errors: z and s/2.
+    s/2 where the modes are not frequencies, and of several planes, since each has the others'
+    errors.
     """
-    s, operators = 1 / jnp.sqrt(shift * precision), convolutions(normal.problem)
+    s = 1 / jnp.sqrt(shift * precision)
     planes = normal.problem.image_shape[-3]
-    if operators is None or planes > 1 or not isinstance(normal, IterativeNormal):
-        return image, s / 2
-    inverse = dataclasses.replace(normal, shift=shift).inverse_filter(operators)[:, 0].real
+    if planes > 1 or not isinstance(normal, IterativeNormal) or normal.powers is None:
+        return s / 2
+    inverse = dataclasses.replace(normal, shift=shift).inverse_filter()[:, 0].real
     power = (inverse - shift * inverse**2) / precision  # M⁻¹ AᵀwA M⁻¹ = M⁻¹ − μ M⁻²
-    rows, columns = window = operators[0].window
+    rows, columns = padded_field(normal.problem.field_shape)
     radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns))
     ring = np.ravel(radius / _RING).astype(int)
     sums = jnp.zeros((*power.shape[:2], ring.max() + 1), power.dtype)
     sums = sums.at[..., ring].add(power.reshape(*power.shape[:2], -1))
-    means = sums / np.bincount(ring).astype(power.dtype)
-    sigma = jnp.maximum(jnp.sqrt(jnp.max(means, axis=-1)), _LEAST_NOISE * s)
-    lacking = jnp.maximum(share * sigma[..., None, None] ** 2 - power, 0)
-
-    def with_more():
-        white = jax.random.normal(key, (*image.shape[:-2], *window), image.dtype)
-        noise = jnp.fft.irfft2(as_complex(jnp.sqrt(lacking)) * jnp.fft.rfft2(white), s=window)
-        return image + noise[..., : image.shape[-2], : image.shape[-1]]
-
-    return jax.lax.cond(share > 0, with_more, lambda: image), sigma
+    means = sums / np.maximum(np.bincount(ring), 1).astype(power.dtype)  # small fields miss some
+    return jnp.maximum(jnp.sqrt(jnp.max(means, axis=-1)), _LEAST_NOISE * s)
 
 
 def _is_slow(problem: InverseProblem) -> bool:
@@ -397,7 +389,7 @@ def _roughly(normal: AbstractNormal, right: Image) -> Image:
 
 
 @eqx.filter_jit
-def _data_step(normal: AbstractNormal, right: Image, image: Image, shift, precision):
+def data_step(normal: AbstractNormal, right: Image, image: Image, shift, precision):
     """z; by conjugate gradients the change from f, up to a part of the noise of Aᵀg."""
     normal = normal.shifted(shift)
     if not isinstance(normal, IterativeNormal):
@@ -406,8 +398,12 @@ def _data_step(normal: AbstractNormal, right: Image, image: Image, shift, precis
     noise = jnp.sqrt(jnp.mean(signs * (normal.applied(signs) - shift * signs)) / precision)
     change = right + shift * image - normal.applied(image)
     size = or_one(jnp.sqrt(jnp.mean(change**2)))
-    tolerance = jnp.clip(_STEP_ERROR * noise / size, 1e-6, 0.1)
-    return image + normal.solution(change, jnp.zeros_like(image), tolerance, INNER_STEPS).value
+    tolerance = jax.lax.stop_gradient(jnp.clip(_STEP_ERROR * noise / size, 1e-6, 0.1))
+
+    def solved(_, right: Image) -> Image:
+        return normal.solution(right, jnp.zeros_like(right), tolerance, INNER_STEPS).value
+
+    return image + jax.lax.custom_linear_solve(normal.applied, change, solved, symmetric=True)
 
 
 @jax.jit

@@ -15,16 +15,10 @@ import pytest
 
 from helpers import ROOT
 from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.denoiser.crops import draw_crops, loss
 from thincam_jax.learn.denoiser.network import LEAST, MOST, DenoiserOptions, create, load_network
 from thincam_jax.learn.denoiser.pictures import TILE, drawn, photographs, split
-from thincam_jax.learn.denoiser.train import (
-    NETWORK,
-    STATE,
-    DenoisingLessons,
-    draw_crops,
-    loss,
-    train_denoiser,
-)
+from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, train_denoiser
 from thincam_jax.learn.training import TrainingOptions
 
 OPTIONS = TrainingOptions(steps=60, rate=2e-2, warm_up=5, check_every=20, averaging=0.9)

@@ -33,7 +33,10 @@ class PicturesConfig(SourceConfig):
 
 
 _USUAL = {"steps": 20000, "warm_up": 100, "falling": 0.5, "averaging": 0.999, "check_every": 500}
-_TRAINING = {"only": (*TRAINING, "falling", "batch", "crop", "judged"), "defaults": _USUAL}
+_TRAINING = {
+    "only": (*TRAINING, "falling", "batch", "crop", "judged", "cameras"),
+    "defaults": _USUAL,
+}
 
 
 class DenoiserNetworkConfig(section(DenoiserOptions)):
