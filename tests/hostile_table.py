@@ -249,5 +249,19 @@ OPTICS = (
         object_distance=550.0,
         orders=3,
     ),
+    call(
+        wg.distance_from_ghosts,
+        camera=call(
+            wg.SeeThroughCamera,
+            screen=call(wg.Screen, hologram=HOLOGRAM, glass_thickness=5.0, glass_index=1.5),
+            sensor=call(tc.Sensor, shape=(20, 22), pitch=100 * um),
+            focal_distance=6.0,
+            lens_distance=10.0,
+        ),
+        capture=1 + np.sin(np.indices((20, 22))).sum(axis=0) / 4,
+        nearest=200.0,
+        farthest=600.0,
+        orders=2,
+    ),
     call(wg.refracted, angle=0.3, before=1.0, after=1.5),
 )

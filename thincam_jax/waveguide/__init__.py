@@ -10,6 +10,9 @@ from thincam_jax.waveguide.camera import SeeThroughCamera as SeeThroughCamera
 from thincam_jax.waveguide.colours import ColourBand as ColourBand
 from thincam_jax.waveguide.colours import ColourCamera as ColourCamera
 from thincam_jax.waveguide.colours import colour_system as colour_system
+from thincam_jax.waveguide.distance import DistanceStatus as DistanceStatus
+from thincam_jax.waveguide.distance import GhostDistance as GhostDistance
+from thincam_jax.waveguide.distance import distance_from_ghosts as distance_from_ghosts
 from thincam_jax.waveguide.efficiency import diffraction_efficiency as diffraction_efficiency
 from thincam_jax.waveguide.efficiency import ghost_weights as ghost_weights
 from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram
