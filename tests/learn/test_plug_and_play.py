@@ -58,7 +58,7 @@ def test_a_denoiser_is_given_the_largest_noise_of_a_mode():
 
     tc.reconstruct(recording(), tc.PlugAndPlay(watched, iterations=3, tolerance=0.0))
     np.testing.assert_allclose(told[1] / np.array(told[1:]), [1, 48**0.5, 48], rtol=1e-6)
-    unit = float(ScaledProblem(recording().problem()).image_unit)
+    unit = float(ScaledProblem(recording().problem(), iterations=4).image_unit)
     for sigma in unit * np.array(told[1:]):
         inverse = np.linalg.inv(matrix.T @ matrix + np.eye(180) / (2 * sigma) ** 2)
         noise = np.linalg.eigvalsh(inverse @ matrix.T @ matrix @ inverse)
@@ -158,7 +158,7 @@ def test_with_a_linear_denoiser_it_ends_in_the_fixed_point_of_a_quadratic_proble
     assert result.status == "iterations_exhausted" and len(found) == 301
     pixels = np.eye(180).reshape(180, *FIELD)
     denoiser = np.asarray(smooth(jnp.asarray(pixels), 0.0)).reshape(180, 180).T
-    unit = float(ScaledProblem(seen.problem()).image_unit)
+    unit = float(ScaledProblem(seen.problem(), iterations=4).image_unit)
     capture, s, image = np.ravel(seen.captures[0]), unit * found[-1][0], unit * found[-1][1]
 
     def step(s):

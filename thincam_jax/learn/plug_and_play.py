@@ -85,6 +85,7 @@ _STEP_ERROR = 0.03
 # Of the normal equations, in units of the precision's rounding, ‖A‖ being 1: with less, as of
 # captures with over 45 dB in single precision, they are not solved, and images explode.
 _LEAST_SHIFT = 64
+_UNIT = 4  # steps of the power method for a unit, which needs to be no closer than that
 _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
 _LEAST_SHARE = 0.02  # of the noise, that the first data step leaves, by which it can be found
 _PARTS, _SMALLEST = 3, 8  # along each side of a capture, and the pixels that such a part has
@@ -224,7 +225,7 @@ class _Run:
         *,
         warm: bool,
     ):
-        scaled = ScaledProblem(problem)
+        scaled = ScaledProblem(problem, iterations=_UNIT)
         self.solver, self.problem, self.unit = solver, scaled.problem, scaled.image_unit
         # 1/variance of a capture in these units.
         self.precision = scaled.curvature * scaled.image_unit**2
@@ -297,7 +298,7 @@ def course(steps: int, begin: float = 1.0) -> list[float]:
 def largest_noise(
     normal: AbstractNormal, shift: Float[Array, ""], precision: Float[Array, ""]
 ) -> Float[Array, "channel 1"] | Float[Array, ""]:
-    """The noise of z that a denoiser is told: the largest of a ring of frequencies, at least 0.4 s.
+    """The noise of z for a denoiser: the largest of a ring of frequencies, at least 0.4 s.
 
     s/2 where the modes are not frequencies, and of several planes, since each has the others'
     errors.
@@ -389,7 +390,13 @@ def _roughly(normal: AbstractNormal, right: Image) -> Image:
 
 
 @eqx.filter_jit
-def data_step(normal: AbstractNormal, right: Image, image: Image, shift, precision):
+def data_step(
+    normal: AbstractNormal,
+    right: Image,
+    image: Image,
+    shift: Float[Array, ""],
+    precision: Float[Array, ""],
+) -> Image:
     """z; by conjugate gradients the change from f, up to a part of the noise of Aᵀg."""
     normal = normal.shifted(shift)
     if not isinstance(normal, IterativeNormal):

@@ -1,5 +1,6 @@
 """The inverse problem of a reconstruction, for any camera with a linear operator."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -392,6 +393,8 @@ class ScaledProblem(eqx.Module):
     - `image_unit`: times this, an image of `problem` is one of the problem given; `capture_unit`:
       the same for captures.
     - `curvature`: Lipschitz constant of the problem given, with a margin.
+
+    Fewer `iterations` of the power method are faster, and ‖√w A‖ may then be somewhat above 1.
     """
 
     problem: InverseProblem
@@ -399,21 +402,21 @@ class ScaledProblem(eqx.Module):
     capture_unit: Float[Array, ""]
     curvature: Float[Array, ""]
 
-    def __init__(self, problem: InverseProblem):
+    def __init__(self, problem: InverseProblem, iterations: int = POWER_ITERATIONS):
         # The minimiser does not depend on these units, nor do its derivatives on theirs.
-        operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem))
+        operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem), iterations)
         self.problem = _divided(problem, operator_unit, captured, heaviest)
         self.image_unit, self.capture_unit = captured / operator_unit, captured
         self.curvature = heaviest * operator_unit**2
 
 
-@jax.jit
-def _units(problem: InverseProblem):
+@functools.partial(jax.jit, static_argnames="iterations")
+def _units(problem: InverseProblem, iterations: int):
     """Units of operators, captures and weights."""
     heaviest = or_one(jnp.stack([jnp.max(w) for w in problem.weights]).max())
     strongest = or_one(jnp.stack([_strength(o) for o in problem.operators]).max())
     captured = _root_mean_square(problem.captures)
-    norm = _norm(_divided(problem, strongest, captured, heaviest))
+    norm = _norm(_divided(problem, strongest, captured, heaviest), iterations)
     return strongest * norm, captured, heaviest
 
 
@@ -456,14 +459,14 @@ def _times(operator: AbstractOperator, factor) -> AbstractOperator:
     return Scaled(operator, factor)
 
 
-def _norm(problem: InverseProblem) -> Float[Array, ""]:
+def _norm(problem: InverseProblem, iterations: int) -> Float[Array, ""]:
     """‖√w A‖ with a margin, by the power method, at most the bound of the spectra."""
     dtype = problem.captures[0].dtype
     (first, *others), (weight, *_) = problem.operators, problem.weights
     if not others and weight.size == 1:  # the operator may know its own norm
-        found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=POWER_ITERATIONS, dtype=dtype)
+        found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=iterations, dtype=dtype)
     else:
-        found = WeightedOperator(problem).norm(iterations=POWER_ITERATIONS, dtype=dtype)
+        found = WeightedOperator(problem).norm(iterations=iterations, dtype=dtype)
     found = MARGIN * found
     operators = convolutions(problem)
     if operators is None:
