@@ -68,6 +68,14 @@ HELP = [
 ]
 
 
+def test_imports_leave_the_accelerator_to_others():
+    """A rig's process waits for hours beside those that compute."""
+    code = "from jax._src import xla_bridge\n"
+    for name in ("hardware.virtual", "measured.calibration", "learn", "design", "studies"):
+        code += f"import thincam_jax.{name}\n"
+    imported_by(code + "assert not xla_bridge.backends_are_initialized()")
+
+
 def test_help_of_a_command_waits_for_nothing():
     """One process answers them all, and has imported nothing slow after any."""
     after = imported_in_turn(*(as_command(typed) for typed in HELP))

@@ -151,9 +151,9 @@ def test_errors(suggester, target, message):
 
 
 def test_training_errors():
-    with pytest.raises(ValueError, match="batch = 0; give at least 1"):
+    with pytest.raises(ValueError, match="batch = 0: give a whole number of at least 1"):
         SuggesterTraining(batch=0)
-    with pytest.raises(ValueError, match="guesses = 0; give at least 1"):
+    with pytest.raises(ValueError, match="guesses = 0: give a whole number of at least 1"):
         SuggesterTraining(guesses=0)
 
 

@@ -13,7 +13,8 @@ Two parts, both with Adam (optax):
 """
 
 import functools
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -21,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import check_fields, quantity, whole
 from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.match import ResponseModel
 from thincam_jax.design.search import even_samples
@@ -72,19 +73,17 @@ class SuggesterTraining:
     **Errors**: ValueError for numbers below 1, and for a rate that is not positive.
     """
 
-    samples: int = 16384
-    guesses: int = 4
-    width: int = 128
-    depth: int = 3
-    warm_up: int = 6000
-    steps: int = 400
-    batch: int = 64
-    rate: float = 4e-3
+    samples: Annotated[int, whole(1)] = 16384
+    guesses: Annotated[int, whole(1)] = 4
+    width: Annotated[int, whole(1)] = 128
+    depth: Annotated[int, whole(1)] = 3
+    warm_up: Annotated[int, whole(1)] = 6000
+    steps: Annotated[int, whole(1)] = 400
+    batch: Annotated[int, whole(1)] = 64
+    rate: Annotated[float, quantity(positive=True)] = 4e-3
 
     def __post_init__(self):
-        counts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rate"}
-        checks.at_least_one(counts)
-        checks.positive("rate", self.rate, "a number")
+        check_fields(self)
 
 
 @checked

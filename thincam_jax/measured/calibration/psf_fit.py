@@ -43,7 +43,6 @@ from thincam_jax.measured.calibration.problem import (
 from thincam_jax.measured.calibration.start import PsfSearch, check_fringes, given, start_near
 from thincam_jax.measured.raw import image_with_contrast
 
-DEFAULT = PsfSearch()
 Weights = Mapping[float, complex | float | int]
 # The phase and weight of each capture of a fringe-scanned one, as in `fringe_scanned_otf`.
 FRINGE_SCANNED = {0.0: 1j, math.pi / 2: -1.0, math.pi: -1j, 3 * math.pi / 2: 1.0}
@@ -113,7 +112,7 @@ def fit_psf(
     weights: Weights | None = None,
     object_distance: Number,
     wavelength: Number,
-    search: PsfSearch = DEFAULT,
+    search: PsfSearch | None = None,
 ) -> PsfFit:
     r"""Fit the exact PSF of a zone aperture to a measured one, by least squares.
 
@@ -154,7 +153,7 @@ def fit_psf(
       the negative phases, these are fitted and `reasons` says that the phases run backwards.
     - `camera`: with a `FresnelZoneAperture`; its numbers are the start.
     - `object_distance`: t, mm, from the mask, or infinity; `wavelength`: λ, mm.
-    - `search`: the numbers to fit, and how far from the camera's.
+    - `search`: the numbers to fit, and how far from the camera's; by default `PsfSearch()`.
 
     **Validity.** That of the Fresnel approximation. The search needs ε < 0.5; beyond, least squares
     start from the camera as given. A start of "width" must be within some √(λd) of the truth.
@@ -177,6 +176,7 @@ def fit_psf(
 
     **See also**: `check_psf`.
     """
+    search = PsfSearch() if search is None else search
     synthesis = _check_weights(psf_image, weights)
     if synthesis is not None and not np.any(np.abs(synthesis.weights.sum(axis=1)) > 1e-6):
         left = tuple(name for name in search.parameters if name != "background")
