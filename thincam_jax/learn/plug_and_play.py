@@ -18,6 +18,7 @@ import dataclasses
 import math
 import os
 import time
+import warnings
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -28,6 +29,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
+from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
 from thincam_jax.reconstruction.methods import AdmmTV, starts_uniform
 from thincam_jax.reconstruction.normal_equations import (
@@ -161,7 +163,9 @@ class PlugAndPlay(AbstractIterativeSolver):
         problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
         if start is None and _is_slow(problem):
             options = {"nonnegative": self.nonnegative, "synthesis": self.synthesis}
-            first = AdmmTV(_TAU, iterations=_ITERATIONS, **options).solve(recording)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
+                first = AdmmTV(_TAU, iterations=_ITERATIONS, **options).solve(recording)
             if first.status == "interrupted":
                 return dataclasses.replace(first, method=self.name)
             start = first.image
