@@ -10,8 +10,8 @@ with w = 1/variance and a deviation s of the prior that falls from step to step.
 that the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at
 most s/2. σ is the largest of a ring of frequencies, since a denoiser sees a neighbourhood; s/2 for
 several planes, and where the modes are not frequencies. The shipped denoiser was trained inside
-these steps, behind other cameras (`ReconstructionLessons`). A last data step, with s/4, gives back
-what the denoiser took from modes that the captures know well.
+these steps, behind drawn cameras (`thincam_jax.learn.denoiser.reconstructions`). A last data step,
+with s/4, gives back what the denoiser took from modes that the captures know well.
 """
 
 import dataclasses
@@ -84,8 +84,8 @@ _FALL, _FURTHER, _EXPLAINED = 0.58, 8, 10
 _TAU, _ITERATIONS = 1.0, 100
 # Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
 _STEP_ERROR = 0.03
-# Of the normal equations, in units of the precision's rounding, ‖A‖ being 1: with less, as of
-# captures with over 45 dB in single precision, they are not solved, and images explode.
+# Least μ of the normal equations, in units of the precision's rounding, where ‖A‖ = 1: with less,
+# as of captures with over 45 dB in single precision, they are not solved, and images explode.
 _LEAST_SHIFT = 64
 _UNIT = 4  # steps of the power method for a unit, which needs to be no closer than that
 _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
@@ -283,9 +283,13 @@ class _Run:
 
     def _data_step(self, s: Float[Array, ""]):
         """The shift of the normal equations, and z."""
-        least = _LEAST_SHIFT * jnp.finfo(self.image.dtype).eps
-        shift = jnp.maximum(1 / (s**2 * self.precision), least)
+        shift = shift_of(s, self.precision)
         return shift, data_step(self.normal, self.right, self.image, shift, self.precision)
+
+
+def shift_of(s: Float[Array, ""], precision: Float[Array, ""]) -> Float[Array, ""]:
+    """μ of the normal equations, as large as they need to be solved."""
+    return jnp.maximum(1 / (s**2 * precision), _LEAST_SHIFT * jnp.finfo(s.dtype).eps)
 
 
 def largest_deviation(image: Image) -> Float[Array, ""]:

@@ -105,7 +105,7 @@ def _reconstructed(network: DenoisingUNet, problem: InverseProblem, precision: A
     right, first = back_projected(problem, problem.captures), uniform_image(problem)
 
     def step(image: Array, s: Array) -> Array:
-        shift = 1 / (s**2 * precision)
+        shift = plug_and_play.shift_of(s, precision)
         found = plug_and_play.data_step(normal, right, image, shift, precision)
         sigma = plug_and_play.largest_noise(normal, shift, precision)
         flat = found.reshape(-1, *found.shape[-2:])
@@ -119,7 +119,7 @@ def _reconstructed(network: DenoisingUNet, problem: InverseProblem, precision: A
     # Of each step only the image is kept: the rest is computed anew for its derivative.
     again = jax.checkpoint(lambda image, s: (step(image, s), None))
     image, _ = jax.lax.scan(again, image, course)
-    shift = 1 / ((plug_and_play.FINAL * course[-1]) ** 2 * precision)
+    shift = plug_and_play.shift_of(plug_and_play.FINAL * course[-1], precision)
     last = plug_and_play.data_step(normal, right, image, shift, precision)
     return jnp.maximum(last, 0)[0, 0]
 
