@@ -33,7 +33,7 @@ class PhaseLevels:
     from thincam_jax.hardware import PhaseLevels
     from thincam_jax.units import nm
 
-    table = PhaseLevels(np.linspace(0, 6.2, 17), 532 * nm)
+    table = PhaseLevels(tuple(np.linspace(0, 6.2, 17)), 532 * nm)
     print(table.levels(np.array([[0.0, 3.1]]), 532 * nm))  # [[  0 128]]
     ```
 
