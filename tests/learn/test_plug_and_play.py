@@ -116,16 +116,30 @@ def test_the_first_image_is_denoised_with_the_noise_that_was_found():
 def test_the_noise_is_that_of_the_noisiest_part():
     """Shot noise is three times as strong in the middle; the mean would say 1.4."""
     rng = np.random.default_rng(4)
-    A = Separable(*(rng.normal(size=n) / 8 for n in ((72, 24), (78, 26))))
-    deviation = np.full((72, 78), SIGMA)
-    deviation[24:48, 26:52] *= 3
-    capture = np.asarray(A(jnp.asarray(rng.random((24, 26))))) + deviation * rng.normal(
-        size=(72, 78)
-    )
+    A = Separable(*(rng.normal(size=n) / 8 for n in ((144, 24), (156, 26))))
+    deviation = np.full((144, 156), SIGMA)
+    deviation[48:96, 52:104] *= 3
+    noise = deviation * rng.normal(size=deviation.shape)
+    capture = np.asarray(A(jnp.asarray(rng.random((24, 26))))) + noise
     problem = tc.Recording(jnp.asarray(capture), A, noise_variance=SIGMA**2).problem()
     normal = normal_equations(problem, jnp.ones(()))
     found = normal.solve(back_projected(problem, problem.captures))
     assert abs(float(noise_mistake(normal, found, normal.shift, jnp.ones(()))) / 3 - 1) < 0.1
+
+
+def test_the_noise_of_enlarged_captures_is_found():
+    """Captures of two distances, one of them interpolated; all frequencies would say 0.8."""
+    rng, sensor = np.random.default_rng(5), tc.Sensor((64, 72), 0.04)
+    mask = tc.FresnelZoneAperture(40.0, width=1.4)
+    cameras = [tc.LenslessCamera(mask, sensor, d) for d in (4.0, 6.5)]
+    model = tc.Cameras(cameras, wavelength=5e-4, object_distance=200.0, field_shape=(24, 28))
+    noise = rng.normal(size=(2, *sensor.shape))
+    seen = tc.Recording(list(SIGMA * noise), model, noise_variance=SIGMA**2)
+    scaled = ScaledProblem(seen.problem())
+    problem, precision = scaled.problem, scaled.curvature * scaled.image_unit**2
+    normal = normal_equations(problem, jnp.asarray(0.1))
+    found = normal.solve(back_projected(problem, problem.captures))
+    assert 0.97 < float(noise_mistake(normal, found, normal.shift, precision)) < 1.1
 
 
 def test_captures_of_little_noise_are_solved_in_single_precision():
@@ -208,6 +222,29 @@ def test_a_dark_field_larger_than_the_sensor_begins_with_total_variation():
     methods = tc.PlugAndPlay(), tc.AdmmTV(1.0, iterations=150)
     errors = [relative_l2(tc.reconstruct(seen, one).image, truth) for one in methods]
     assert errors[0] < 1.01 * errors[1]
+
+
+@pytest.mark.thorough
+def test_planes_told_half_of_their_noise_begin_as_smooth():
+    """At 14 dB; told half of the noise, total variation alone leaves much of it."""
+    mask, sensor = tc.FresnelZoneAperture(40.0, width=1.4), tc.Sensor((64, 72), 0.04)
+    camera, distances = tc.LenslessCamera(mask, sensor, 5.0), (40.0, 120.0)
+    model = tc.Cameras([camera], wavelength=5e-4, object_distance=distances, field_shape=(24, 28))
+    picture = np.float32(resize(sample_image("camera"), (24, 28)))
+    near = np.indices((24, 28))[1] < 14
+    truth = np.stack([picture * near, picture * ~near])
+    blank = tc.Recording([np.zeros(sensor.shape, np.float32)], model).problem()
+    capture = np.asarray(blank.operators[0](jnp.asarray(truth)[None]))
+    noise = 0.2 * capture.std()
+    noisy = capture + noise * np.random.default_rng(6).standard_normal(capture.shape, np.float32)
+    errors = []
+    for part in (1, 0.5):
+        seen = tc.Recording(
+            [noisy.reshape(sensor.shape)], model, noise_variance=(part * noise) ** 2
+        )
+        for solver in (tc.PlugAndPlay(), tc.AdmmTV(1.0)):
+            errors.append(relative_l2(tc.reconstruct(seen, solver).image[:, ::-1, ::-1], truth))
+    assert errors[0] < 0.95 * errors[1] and errors[2] < 1.02 * errors[0]
 
 
 @pytest.mark.thorough

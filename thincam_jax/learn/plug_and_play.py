@@ -63,9 +63,9 @@ from thincam_jax.reconstruction.solver import (
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# s falls from twice the brightness of the image to a 24th of it; given a start, from a twelfth of
+# s falls from twice the brightness of the image to a 24th of it; given a start, from a quarter of
 # that. From once the brightness dark images at 20 dB stay 1.5 dB below.
-_FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 12
+_FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 4
 # Width of the rings, cycles per pixel. Narrower ones gain less. Wider ones leave noise in a band:
 # method A loses 0.3 dB of a photograph with rings four times as wide, 3 dB with the mean of all.
 _RING = 1 / 64
@@ -79,8 +79,8 @@ FINAL = 0.25
 # more below.
 _FALL, _FURTHER, _EXPLAINED = 0.58, 8, 10
 # Weight and iterations of the image by total variation from which several planes begin, and fields
-# with more pixels than the captures: what captures hardly show takes too many data steps. It gains
-# planes up to 0.9 dB; a dark room at 40 dB up to 15 dB.
+# with as many pixels as the captures: what captures hardly show takes too many data steps. It gains
+# a dark room at 40 dB up to 15 dB. Half of the iterations lose planes 1 dB.
 _TAU, _ITERATIONS = 1.0, 100
 # Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
 _STEP_ERROR = 0.03
@@ -157,40 +157,28 @@ class PlugAndPlay(AbstractIterativeSolver):
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ):
-        """Reconstruct; with a start image s begins at a twelfth of its usual course."""
+        """Reconstruct; with a start image s begins at a quarter of its usual value."""
         began = time.perf_counter()
         apart = TotalVariation(coupling="none")  # colours
         problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
-        if start is None and _is_slow(problem):
-            options = {"nonnegative": self.nonnegative, "synthesis": self.synthesis}
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
-                first = AdmmTV(_TAU, iterations=_ITERATIONS, **options).solve(recording)
-            if first.status == "interrupted":
-                return dataclasses.replace(first, method=self.name)
-            start = first.image
-        image = None
+        parts = _parts(problem)
+        bright = 1.0 if starts_uniform(recording, problem) else 0.0
+        images = [bright * uniform_image(part) for part in parts]
         if start is not None:
             image = first_image(problem, recording.oriented(start), uniform=True)
-        parts = _parts(problem)
-        each: Any = [None] * len(parts)
-        if image is not None:
-            each = list(image.reshape(len(parts), *parts[0].image_shape))
+            images = _split(image, parts)
         history: list[Progress] = []
         status: Status = "iterations_exhausted"
-        bright = 1.0 if starts_uniform(recording, problem) else 0.0
-        images = [
-            bright * uniform_image(p) if f is None else f for p, f in zip(parts, each, strict=True)
-        ]
+        runs: list[_Run] = []
         try:
-            runs: list[_Run] = []
             for part, image in zip(parts, images, strict=True):
                 like = runs[0].normal if runs else None
                 runs.append(_Run(self, part, image, like, warm=start is not None))
+            if start is None and _is_slow(problem):
+                self._begin_smooth(recording, problem, runs)
             for number in range(self.iterations + _FURTHER + 1):
                 for run in runs:
                     run.advance(number)
-                images = [run.result for run in runs]
                 progress = Progress(
                     number,
                     sum(run.misfit for run in runs),
@@ -208,17 +196,32 @@ class PlugAndPlay(AbstractIterativeSolver):
                     status = "stopped"
                     break
             if status != "non_finite":
-                images = [run.finished() for run in runs]
+                for run in runs:
+                    run.finish()
         except KeyboardInterrupt:
             status = "interrupted"
+        images = [run.result for run in runs] + images[len(runs) :]
         done, seconds = max(len(history) - 1, 0), time.perf_counter() - began
         whole_image = jnp.stack(images).reshape(problem.image_shape)
         outcome = Outcome(whole_image, status, tuple(history), done, seconds)
         return recording.reconstruction(outcome, self.name)
 
+    def _begin_smooth(self, recording: Recording, problem: InverseProblem, runs: list["_Run"]):
+        """Begin the runs with images by total variation, told the noise that was found."""
+        tau = _TAU * max(run.mistake for run in runs)
+        options = {"nonnegative": self.nonnegative, "synthesis": self.synthesis}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
+            first = AdmmTV(tau, iterations=_ITERATIONS, **options).solve(recording)
+        image = first_image(problem, recording.oriented(first.image), uniform=True)
+        for run, own in zip(runs, _split(image, [run.given for run in runs]), strict=True):
+            run.begin(own, warm=True)
+        if first.status == "interrupted":
+            raise KeyboardInterrupt
+
 
 class _Run:
-    """The iteration of one image: `result` is the last finite one."""
+    """The iteration of one image: `result` is the last finite one, `mistake` that of the noise."""
 
     def __init__(
         self,
@@ -230,40 +233,42 @@ class _Run:
         warm: bool,
     ):
         scaled = ScaledProblem(problem, iterations=_UNIT)
-        self.solver, self.problem, self.unit = solver, scaled.problem, scaled.image_unit
+        self.solver, self.given = solver, problem
+        self.problem, self.unit = scaled.problem, scaled.image_unit
         # 1/variance of a capture in these units.
         self.precision = scaled.curvature * scaled.image_unit**2
         self.normal = _normal(scaled.problem, jnp.ones_like(self.precision), like)
         self.right = back_projected(scaled.problem, scaled.problem.captures)
-        self.result = image
-        self.image = image / self.unit
-        level = uniform_image(problem) / self.unit
-        seen = brightness(self.image) if warm else jnp.max(level)
-        self.s = self.largest = or_one(_FIRST * seen) * (_WARM if warm else 1)
-        self.course = course(solver.iterations, _WARM if warm else 1.0)
+        self.begin(image, warm=warm)
+        mistake = noise_mistake(self.normal, self.found, self.shift, self.precision)
+        self.mistake, self.precision = float(mistake), self.precision / mistake**2
         self.misfit = self.gap = self.change = math.nan
 
+    def begin(self, image: Image, *, warm: bool) -> None:
+        """The first data step, from an image that is near to the one sought, or from any other."""
+        self.result, self.image = image, image / self.unit
+        seen = brightness(self.image) if warm else jnp.max(uniform_image(self.given)) / self.unit
+        self.s = self.largest = or_one(_FIRST * seen) * (_WARM if warm else 1)
+        self.course = course(self.solver.iterations, _WARM if warm else 1.0)
+        self._step(self.s)
+
     def advance(self, number: int) -> None:
-        """Data step and denoiser; the first one finds the noise."""
+        """Data step, but for the first one, and denoiser."""
         solver = self.solver
         if number > solver.iterations:
             if self.is_explained:
                 return
-            self.s = self.s * _FALL
+            self._step(self.s * _FALL)
         elif number:
-            self.s = self.largest * self.course[number - 1]
-        shift, found = self._data_step(self.s)
-        if not bool(jnp.isfinite(found).all()):
+            self._step(self.largest * self.course[number - 1])
+        if not bool(jnp.isfinite(self.found).all()):
             self.misfit = math.nan
             return
-        if number == 0:
-            mistake = noise_mistake(self.normal, found, shift, self.precision)
-            self.precision = self.precision / mistake**2
-        noise = largest_noise(self.normal, shift, self.precision)
-        sigma = jnp.broadcast_to(solver.strength.astype(noise.dtype) * noise, found.shape[:-2])
-        image = solver.denoiser(found, sigma)
+        noise = largest_noise(self.normal, self.shift, self.precision)
+        sigma = jnp.broadcast_to(solver.strength.astype(noise.dtype) * noise, self.found.shape[:-2])
+        image = solver.denoiser(self.found, sigma)
         image = jnp.maximum(image, 0) if solver.nonnegative else image
-        chi, gap, change = _judged(self.problem, self.precision, self.image, found, image)
+        chi, gap, change = _judged(self.problem, self.precision, self.image, self.found, image)
         if number == 0:
             self.largest = largest_deviation(image)
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
@@ -275,16 +280,16 @@ class _Run:
         """Whether the image differs from the captures by little more than their noise."""
         return 2 * self.misfit < _EXPLAINED * sum(c.size for c in self.problem.captures)
 
-    def finished(self) -> Image:
-        """The image after one more data step."""
-        _, image = self._data_step(self.s * FINAL)
-        image = jnp.maximum(image, 0) if self.solver.nonnegative else image
-        return jnp.where(jnp.isfinite(image).all(), image * self.unit, self.result)
+    def finish(self) -> None:
+        """One more data step."""
+        self._step(self.s * FINAL)
+        image = jnp.maximum(self.found, 0) if self.solver.nonnegative else self.found
+        self.result = jnp.where(jnp.isfinite(image).all(), image * self.unit, self.result)
 
-    def _data_step(self, s: Float[Array, ""]):
-        """The shift of the normal equations, and z."""
-        shift = shift_of(s, self.precision)
-        return shift, data_step(self.normal, self.right, self.image, shift, self.precision)
+    def _step(self, s: Float[Array, ""]) -> None:
+        """`found`, z of a data step with s."""
+        self.s, self.shift = s, shift_of(s, self.precision)
+        self.found = data_step(self.normal, self.right, self.image, self.shift, self.precision)
 
 
 def shift_of(s: Float[Array, ""], precision: Float[Array, ""]) -> Float[Array, ""]:
@@ -327,9 +332,13 @@ def largest_noise(
 
 
 def _is_slow(problem: InverseProblem) -> bool:
-    """Whether there are several planes, or more unknowns than pixels."""
+    """Whether there are several planes, or as many unknowns as pixels."""
     pixels = sum(math.prod(c.shape[-2:]) for c in problem.captures)
-    return problem.image_shape[-3] > 1 or math.prod(problem.image_shape[-2:]) > pixels
+    return problem.image_shape[-3] > 1 or math.prod(problem.image_shape[-2:]) >= pixels
+
+
+def _split(image: Image, parts: list[InverseProblem]) -> list[Image]:
+    return list(image.reshape(len(parts), *parts[0].image_shape))
 
 
 def _normal(
@@ -370,15 +379,24 @@ def noise_mistake(
 
 
 def _local_power(problem: InverseProblem, image: Image) -> Array:
-    """Means of w (A f − g)² over captures and their parts, of _PARTS along each axis."""
+    """Means of w (A f − g)² over captures and their parts, of _PARTS along each axis.
+
+    Pixels are averaged with their neighbours before, since captures that were interpolated, such as
+    those of two distances, have next to none of their noise at high frequencies.
+    """
     means = []
     for r, w, o in zip(residuals(problem, image), problem.weights, problem.operators, strict=True):
-        power, sides = w * r**2, detector_shape(o)
+        left, sides = jnp.sqrt(w) * r, detector_shape(o)
         if min(sides) < _SMALLEST * _PARTS:
-            means.append(jnp.mean(power))
+            means.append(jnp.mean(left**2))
             continue
-        for axis, side in enumerate(sides, power.ndim - len(sides)):
-            power = jnp.moveaxis(power, axis, 0)[: side // _PARTS * _PARTS]
+        for axis in range(-len(sides), 0):
+            left = jnp.moveaxis(left, axis, 0)
+            left = jnp.moveaxis((left[1:] + left[:-1]) / 2, 0, axis)
+        power = left**2
+        for axis in range(-len(sides), 0):
+            power = jnp.moveaxis(power, axis, 0)
+            power = power[: len(power) // _PARTS * _PARTS]
             power = power.reshape(_PARTS, -1, *power.shape[1:]).mean(axis=1)
             power = jnp.moveaxis(power, 0, axis)
         means.append(power.mean(axis=tuple(range(power.ndim - len(sides)))))
