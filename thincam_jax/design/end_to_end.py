@@ -8,7 +8,8 @@ are restored as the best linear estimate under the prior η_f,
     \Big(1 + S \sum_c \frac{A_c^T A_c}{\sigma_c^2} S\Big) z
     = S \sum_c \frac{A_c^T g_c}{\sigma_c^2}, \qquad S = \eta_f^{1/2}
 
-by conjugate gradients. Their derivative is taken implicitly, at the solution, by another solve.
+by conjugate gradients, preconditioned by the mean of AᵀA/σ² over rings of frequencies, which white
+noise shows. Their derivative is taken implicitly, at the solution, by another solve.
 
 With a denoiser D that estimate is the start of plug and play, as `thincam_jax.learn.PlugAndPlay`
 does it: with a deviation s of the prior that falls by steps,
@@ -20,6 +21,7 @@ does it: with a deviation s of the prior that falls by steps,
 and a last z with half of the denoiser's σ as s. All steps are differentiated.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,7 +32,7 @@ import numpy as np
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax._core.precision import as_complex
+from thincam_jax._core.precision import as_complex, squared_modulus
 from thincam_jax.design.design import Design
 from thincam_jax.design.training import Channel, Training, channels_of, relative_error
 from thincam_jax.reconstruction.problem import brightness
@@ -84,27 +86,27 @@ class _Captures:
         self.cameras, self.variances = cameras, [variance for _, variance in measured]
         self.training, self.image = training, training.images[0]
         self.right = self._back([capture for capture, _ in measured])
+        self.powers = jax.lax.stop_gradient(self._mean_powers())
 
     def linear_estimate(self) -> Image:
         root = _prior_root(self.training)
-
-        def shaped(x):
-            return jnp.fft.irfft2(jnp.fft.rfft2(x) * as_complex(root), s=x.shape)
-
-        return shaped(
-            self._solved(lambda z: z + shaped(self._normal(shaped(z))), shaped(self.right))
+        found = self._solved(
+            lambda z: z + _filtered(root, self._normal(_filtered(root, z))),
+            _filtered(root, self.right),
+            root**2,
         )
+        return _filtered(root, found)
 
     def plug_and_play(self, image: Image, denoiser: Callable, brightness: Array) -> Image:
         sigmas = [deviation / 2 * brightness for deviation in _DEVIATIONS]
-        for sigma in sigmas:
+        for sigma in sigmas:  # a loop by XLA would run its convolutions ten times as slowly
             image = jnp.maximum(denoiser(self._data_step(image, 2 * sigma), sigma), 0)
         return jnp.maximum(self._data_step(image, sigmas[-1] / 2), 0)
 
     def _data_step(self, image: Image, s: Array) -> Image:
         # The change is solved for: it is small, and so is the error that its tolerance leaves.
         change = s**2 * (self.right - self._normal(image))
-        return image + self._solved(lambda x: x + s**2 * self._normal(x), change)
+        return image + self._solved(lambda x: x + s**2 * self._normal(x), change, s**2)
 
     def _normal(self, image: Image) -> Image:
         return self._back([camera(image) for camera in self.cameras])
@@ -115,19 +117,38 @@ class _Captures:
             total = total + jax.linear_transpose(camera, self.image)(capture / v)[0]
         return total
 
-    def _solved(self, matrix: Callable, right: Image) -> Image:
+    def _mean_powers(self) -> Float[Array, "v u"]:
+        """AᵀA/σ² at the frequencies of the image, a mean over rings of one cycle an image."""
+        shape = self.image.shape
+        noise = jax.random.normal(jax.random.key(0), shape, self.image.dtype)
+        # Traced, since a camera refuses a known image that is negative.
+        given, seen = jnp.fft.rfft2(noise), jnp.fft.rfft2(jax.jit(self._normal)(noise))
+        v, u = np.fft.fftfreq(shape[0]) * shape[0], np.fft.rfftfreq(shape[1]) * shape[1]
+        ring = np.rint(np.hypot(v[:, None], u)).astype(int)
+        sums = jnp.zeros(ring.max() + 1, noise.dtype)
+        power = sums.at[ring].add((given.conj() * seen).real)
+        return (jnp.maximum(power, 0) / sums.at[ring].add(squared_modulus(given)))[ring]
+
+    def _solved(self, matrix: Callable, right: Image, share: Array) -> Image:
+        """The solution for 1 + AᵀA/σ² times a share of each frequency."""
         tolerance, steps = self.training.solver.tolerance, self.training.solver.steps
+        inverse = jax.lax.stop_gradient(1 / (1 + share * self.powers))
 
         def solve(matrix, b):
-            limit = tolerance * jnp.linalg.norm(b)
-            found, _ = cg(matrix, b, tol=tolerance, maxiter=steps)
+            limit, about = tolerance * jnp.linalg.norm(b), functools.partial(_filtered, inverse)
+            found, _ = cg(matrix, b, tol=tolerance, maxiter=steps, M=about)
             # In single precision the residual that is carried along may differ from this one,
             # and rounding may leave more than the limit.
-            more, _ = cg(matrix, b - matrix(found), tol=0.0, atol=limit, maxiter=steps)
+            left = b - matrix(found)
+            more, _ = cg(matrix, left, tol=0.0, atol=limit, maxiter=steps, M=about)
             left = jnp.linalg.norm(matrix(found + more) - b)
             return jnp.where(left <= 10 * limit, found + more, jnp.nan)
 
         return jax.lax.custom_linear_solve(matrix, right, solve, symmetric=True)
+
+
+def _filtered(response: Array, image: Image) -> Image:
+    return jnp.fft.irfft2(jnp.fft.rfft2(image) * as_complex(response), s=image.shape)
 
 
 def _prior_root(training: Training) -> Float[Array, "v u"]:
