@@ -235,22 +235,26 @@ class _Run:
         scaled = ScaledProblem(problem, iterations=_UNIT)
         self.solver, self.given = solver, problem
         self.problem, self.unit = scaled.problem, scaled.image_unit
-        # 1/variance of a capture in these units.
-        self.precision = scaled.curvature * scaled.image_unit**2
-        self.normal = _normal(scaled.problem, jnp.ones_like(self.precision), like)
+        # 1/variance of a capture in these units, as told.
+        self.told = scaled.curvature * scaled.image_unit**2
+        self.normal = _normal(scaled.problem, jnp.ones_like(self.told), like)
         self.right = back_projected(scaled.problem, scaled.problem.captures)
         self.begin(image, warm=warm)
-        mistake = noise_mistake(self.normal, self.found, self.shift, self.precision)
-        self.mistake, self.precision = float(mistake), self.precision / mistake**2
         self.misfit = self.gap = self.change = math.nan
 
     def begin(self, image: Image, *, warm: bool) -> None:
-        """The first data step, from an image that is near to the one sought, or from any other."""
+        """The first data step, which finds the noise, from an image near to the one sought or not.
+
+        What a far one leaves of the captures counts as noise: it is found anew from a near one.
+        """
         self.result, self.image = image, image / self.unit
         seen = brightness(self.image) if warm else jnp.max(uniform_image(self.given)) / self.unit
         self.s = self.largest = or_one(_FIRST * seen) * (_WARM if warm else 1)
         self.course = course(self.solver.iterations, _WARM if warm else 1.0)
+        self.precision = self.told
         self._step(self.s)
+        mistake = noise_mistake(self.normal, self.found, self.shift, self.precision)
+        self.mistake, self.precision = float(mistake), self.precision / mistake**2
 
     def advance(self, number: int) -> None:
         """Data step, but for the first one, and denoiser."""
