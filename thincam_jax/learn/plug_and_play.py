@@ -215,7 +215,7 @@ class PlugAndPlay(AbstractIterativeSolver):
             first = AdmmTV(tau, iterations=_ITERATIONS, **options).solve(recording)
         image = first_image(problem, recording.oriented(first.image), uniform=True)
         for run, own in zip(runs, _split(image, [run.given for run in runs]), strict=True):
-            run.begin(own, warm=True)
+            run.begin(own, warm=True, fitted=True)
         if first.status == "interrupted":
             raise KeyboardInterrupt
 
@@ -242,19 +242,22 @@ class _Run:
         self.begin(image, warm=warm)
         self.misfit = self.gap = self.change = math.nan
 
-    def begin(self, image: Image, *, warm: bool) -> None:
-        """The first data step, which finds the noise, from an image near to the one sought or not.
+    def begin(self, image: Image, *, warm: bool, fitted: bool = False) -> None:
+        """The first data step, and the noise, from an image that is near to the one sought or not.
 
-        What a far one leaves of the captures counts as noise: it is found anew from a near one.
+        A `fitted` one leaves of the captures what the smallest s leaves of them: their noise. A
+        dark room's data steps with the first s explain any noise, and those of planes too little.
         """
         self.result, self.image = image, image / self.unit
         seen = brightness(self.image) if warm else jnp.max(uniform_image(self.given)) / self.unit
-        self.s = self.largest = or_one(_FIRST * seen) * (_WARM if warm else 1)
+        self.largest = or_one(_FIRST * seen)
         self.course = course(self.solver.iterations, _WARM if warm else 1.0)
         self.precision = self.told
-        self._step(self.s)
+        self._step(self.largest * self.course[-1 if fitted else 0])
         mistake = noise_mistake(self.normal, self.found, self.shift, self.precision)
         self.mistake, self.precision = float(mistake), self.precision / mistake**2
+        if fitted:
+            self._step(self.largest * self.course[0])
 
     def advance(self, number: int) -> None:
         """Data step, but for the first one, and denoiser."""
