@@ -313,6 +313,15 @@ def report(name, noise, plane, methods):
     return np.mean((pnp - tv)[:-2])
 
 
+def least_gain(name, noise):
+    """What 24 photographs are to gain on average; of a few, that they do not lose."""
+    if COUNT < 24:
+        return -0.1
+    if noise.endswith("e"):
+        return 0.1
+    return 0.8 if "mm" in name else 0.4
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of others' networks
 @pytest.mark.parametrize("name", CASES)
 def test_plug_and_play(name, capsys):
@@ -338,5 +347,6 @@ def test_plug_and_play(name, capsys):
                 method.run(recording, truth)
         with capsys.disabled():
             planes = range(len(methods["TV"].scores[0]))
-            gains += [report(name, noise, plane, methods) for plane in planes]
-    assert min(gains) > -0.1
+            wanted = least_gain(name, noise)
+            gains += [report(name, noise, plane, methods) - wanted for plane in planes]
+    assert min(gains) > 0
