@@ -206,9 +206,8 @@ def test_the_shipped_denoiser_beats_a_linear_estimate(kind):
     assert found.status in ("converged", "iterations_exhausted")
 
 
-@pytest.mark.thorough
-def test_a_dark_field_larger_than_the_sensor_begins_with_total_variation():
-    """At 40 dB, in single precision, where data steps alone leave twice the error."""
+def dark_field(noise: float):
+    """A picture in a dark field larger than the sensor, and a capture, noise, and their camera."""
     rng, sensor, field = np.random.default_rng(2), (48, 52), (95, 103)
     y, x = np.indices((142, 154)) - np.array([70.5, 76.5])[:, None, None]
     psf = (1 + np.cos(0.04 * (y**2 + x**2))) * (abs(y) < 24) * (abs(x) < 26) / 600
@@ -216,12 +215,27 @@ def test_a_dark_field_larger_than_the_sensor_begins_with_total_variation():
     truth = np.zeros(field, np.float32)
     truth[32:64, 34:68] = resize(sample_image("camera"), (32, 34))
     capture = np.asarray(A(jnp.asarray(truth)))
-    noise = 0.01 * capture.std()
-    noisy = capture + noise * rng.standard_normal(sensor, np.float32)
+    noise = noise * capture.std()
+    return truth, capture + noise * rng.standard_normal(sensor, np.float32), noise, A
+
+
+@pytest.mark.thorough
+def test_a_dark_field_larger_than_the_sensor_begins_with_total_variation():
+    """At 40 dB, in single precision, where data steps alone leave twice the error."""
+    truth, noisy, noise, A = dark_field(0.01)
     seen = tc.Recording(noisy, A, noise_variance=noise**2)
     methods = tc.PlugAndPlay(), tc.AdmmTV(1.0, iterations=150)
     errors = [relative_l2(tc.reconstruct(seen, one).image, truth) for one in methods]
     assert errors[0] < 1.01 * errors[1]
+
+
+@pytest.mark.thorough
+def test_a_dark_field_told_half_or_twice_of_its_noise_is_found_as_well():
+    """At 20 dB; told half, the first data step explains all noise, and left a third more error."""
+    truth, noisy, noise, A = dark_field(0.1)
+    seen = [tc.Recording(noisy, A, noise_variance=(part * noise) ** 2) for part in (1, 0.5, 2)]
+    errors = [relative_l2(tc.reconstruct(one, tc.PlugAndPlay()).image, truth) for one in seen]
+    assert max(errors) < 1.05 * errors[0]
 
 
 @pytest.mark.thorough
