@@ -185,7 +185,7 @@ PAIR = (0.0, 3 * np.pi / 2)
 CASES = {
     **{
         f"zone aperture, {t:g} mm": (lambda t=t: zone_plate(distances=(t,)))
-        for t in (60.0, 100.0, 200.0)
+        for t in (60.0, 80.0, 100.0, 150.0, 200.0)
     },
     "zone aperture, a quarter of the sensor": lambda: zone_plate(128),
     "fringe scanning": lambda: phased([(25.0, 6.5)], ZEROS),
