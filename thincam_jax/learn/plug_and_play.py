@@ -210,7 +210,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         return recording.reconstruction(outcome, self.name)
 
     def _begin_smooth(self, recording: Recording, problem: InverseProblem, runs: list["_Run"]):
-        """Begin the runs with images by total variation, told the noise that was found."""
+        """Begin the runs with images by total variation of the noise that was found."""
         tau = _TAU * max(run.mistake for run in runs)
         options = {"nonnegative": self.nonnegative, "synthesis": self.synthesis}
         with warnings.catch_warnings():
@@ -238,9 +238,9 @@ class _Run:
         scaled = ScaledProblem(problem, iterations=_UNIT)
         self.solver, self.given = solver, problem
         self.problem, self.unit = scaled.problem, scaled.image_unit
-        # 1/variance of a capture in these units, as told.
-        self.told = scaled.curvature * scaled.image_unit**2
-        self.normal = _normal(scaled.problem, jnp.ones_like(self.told), like)
+        # 1/variance of a capture in these units, as it was given.
+        self.given_precision = scaled.curvature * scaled.image_unit**2
+        self.normal = _normal(scaled.problem, jnp.ones_like(self.given_precision), like)
         self.right = back_projected(scaled.problem, scaled.problem.captures)
         self.begin(image, warm=warm)
         self.misfit = self.gap = self.change = math.nan
@@ -254,7 +254,7 @@ class _Run:
         seen = brightness(self.image) if warm else jnp.max(uniform_image(self.given)) / self.unit
         self.largest = or_one(_FIRST * seen)
         self.course = course(self.solver.iterations, _WARM if warm else 1.0)
-        self.precision = self.told
+        self.precision = self.given_precision
         self._step(self.largest * (_FITTED if fitted else self.course[0]))
         mistake = noise_mistake(self.normal, self.found, self.shift, self.precision)
         self.mistake, self.precision = float(mistake), self.precision / mistake**2
