@@ -51,7 +51,7 @@ from thincam_jax.design.setup import PhotonNoise
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruction import Wiener
+from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.studies.held_out import HeldOut, further_photographs, hold_out
 from thincam_jax.studies.study import Method, Study, Synthesis
 from thincam_jax.studies.trials import simulate_trials
@@ -165,8 +165,9 @@ class DesignStudy:
         return self.with_designs({one.name: one.design for one in found.found[: self.best]})
 
     def method(self, name: str, design: Design) -> Method:
-        """A design as a method of the study, with the synthesis of the one to beat."""
-        return as_method(self.study.mask, name, design, self.study.methods[0].synthesis)
+        """A design as a method of the study, with synthesis and solver of the one to beat."""
+        first = self.study.methods[0]
+        return as_method(self.study.mask, name, design, first.synthesis, first.solver)
 
     def run(self, progress: Progress | None = None) -> "DesignResult":
         """Search, train, simulate and search for the fronts, all in memory."""
@@ -184,7 +185,9 @@ class DesignStudy:
         )
 
 
-def as_method(mask: AbstractMask, name: str, design: Design, synthesis: Synthesis) -> Method:
+def as_method(
+    mask: AbstractMask, name: str, design: Design, synthesis: Synthesis, solver: AbstractSolver
+) -> Method:
     """A design as a method of a study whose masks are shown as `mask` is.
 
     On a display, a width other than that of `mask` is rounded down to whole pixels.
@@ -203,7 +206,7 @@ def as_method(mask: AbstractMask, name: str, design: Design, synthesis: Synthesi
         width=width,
         relative_time=np.asarray(design.exposure),
     )
-    return Method(name, exposures, Wiener(), synthesis, design.phases)
+    return Method(name, exposures, solver, synthesis, design.phases)
 
 
 @dataclass(frozen=True, eq=False)

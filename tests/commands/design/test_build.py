@@ -31,6 +31,13 @@ def test_measured_prior_and_photon_noise(tmp_path):
     assert (float(setup.noise.electrons), float(setup.noise.read_noise)) == (900, 4)
 
 
+@pytest.mark.parametrize("kind", ["wiener", "pnp"])
+def test_designs_are_simulated_with_the_reconstruction_of_the_file(kind, tmp_path):
+    study = tiny.built(tmp_path, f"validate.reconstruction={kind}")
+    with_another = study.with_designs({"found": study.problem.space.base})
+    assert [method.solver.name for method in with_another.methods] == [kind, kind]
+
+
 def test_objectives_have_the_settings_of_the_file(tmp_path):
     asked = "search.tolerances={distance: 30 um, beta: 0.002}"
     robust = tiny.built(tmp_path, "search.objective=robust_error", asked).problem.objective

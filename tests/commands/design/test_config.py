@@ -169,6 +169,11 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
         ("reference.name=Found 1", "reference.name", "is what another or a found design is called"),
         ("search.band=[0.1, 0.4]", "search", "objective bayes_error has no band"),
         ("validate.seeds=0", "validate.seeds", "greater than or equal to 1"),
+        (
+            "validate.reconstruction=fista",
+            "validate.reconstruction",
+            "'wiener', 'admm_tv' or 'pnp'",
+        ),
         ("validate.runs=1", "validate.runs", "unknown key; allowed here: seeds, best"),
         ("validation.seeds=1", "validation", "unknown key; allowed here: name, title,"),
         ("noise.read_noise=8", "noise", "give either snr_db"),

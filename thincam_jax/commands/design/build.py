@@ -6,7 +6,13 @@ from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig, SearchConfig
 from thincam_jax.commands.mask import MaskConfig
-from thincam_jax.commands.sections import MethodConfig, MethodShotConfig, SensorConfig, StudyConfig
+from thincam_jax.commands.sections import (
+    MethodConfig,
+    MethodShotConfig,
+    SensorConfig,
+    StudyConfig,
+    build_solver,
+)
 from thincam_jax.commands.study import build
 from thincam_jax.design import (
     AbstractObjective,
@@ -72,10 +78,13 @@ def build_designs(config: DesignConfig) -> Study:
         drawn = MaskConfig.model_construct(**dict(config.mask))
         mask, sensor = build.build_optics(drawn, sensor, first)
         synthesis = config.reference.synthesis
+        solver = build_solver(config.validation.reconstruction, None)
         return Study(
             mask,
             sensor,
-            tuple(as_method(mask, name, design, synthesis) for name, design in given.items()),
+            tuple(
+                as_method(mask, name, design, synthesis, solver) for name, design in given.items()
+            ),
             object_distance=config.object.distance,
             noise=config.noise.simulated().build(),
             model=config.model,

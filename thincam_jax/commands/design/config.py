@@ -238,6 +238,7 @@ class ValidateConfig(Section):
     seeds: Annotated[int, Field(ge=1, le=100)] = 5
     best: Annotated[int, Field(ge=1, le=10)] = 3
     photographs: Annotated[int, Field(ge=0, le=16)] = 12
+    reconstruction: Literal["wiener", "admm_tv", "pnp"] = "wiener"
 
 
 class TrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))):

@@ -55,9 +55,10 @@ def page(config: DesignConfig, design: DesignScores) -> Page:
         pareto = (Picture("pareto.png", "Pareto fronts", _FRONTS.format(edge)), *fronts(design))
     seeds = design.validation.seeds
     simulated = (
-        "Full captures, Wiener synthesis, and PSNR after a least-squares gain and offset; mean ± "
-        f"standard deviation over {seeds} seeds of the noise. Six elements of the chart halve the "
-        "line pair. `found.yaml` is this comparison as a study for `thincam run`."
+        f"Full captures, reconstruction by {config.validation.reconstruction}, and PSNR after a "
+        f"least-squares gain and offset; mean ± standard deviation over {seeds} seeds of the "
+        "noise. Six elements of the chart halve the line pair. `found.yaml` is this comparison as "
+        "a study for `thincam run`."
     )
     found = (
         design.designs_table(),
