@@ -11,8 +11,8 @@ are restored as the best linear estimate under the prior η_f,
 by conjugate gradients, preconditioned by the mean of AᵀA/σ² over rings of frequencies, which white
 noise shows. Their derivative is taken implicitly, at the solution, by another solve.
 
-With a denoiser D that estimate is the start of plug and play, as `thincam_jax.learn.PlugAndPlay`
-does it: with a deviation s of the prior that falls by steps,
+With a denoiser D that estimate is the start of plug and play, much as that of
+`thincam_jax.learn.PlugAndPlay`: with a deviation s of the prior that falls in four steps,
 
 .. math:: \hat f \leftarrow D(z, s/2), \qquad
     \Big(\sum_c \frac{A_c^T A_c}{\sigma_c^2} + \frac1{s^2}\Big) z

@@ -301,9 +301,7 @@ def _value(objective: Objective, space: DesignSpace, data: Any, point: Float[Arr
 
 @functools.partial(jax.jit, static_argnames=("objective", "at_a_time"))
 def _evaluate(objective, space, data, points, at_a_time: int) -> Float[Array, " point"]:
-    def at(point):
-        return objective(space.design(point), data)
-
+    at = functools.partial(_value, objective, space, data)
     return jax.lax.map(at, points, batch_size=at_a_time)
 
 

@@ -114,7 +114,7 @@ class PlugAndPlay(AbstractIterativeSolver):
 
     Nothing is to be tuned. The noise is taken as the recording tells, corrected by up to four times
     where the residual of the first data step is another. Each image, colour and plane is denoised
-    by itself. Several planes, and fields larger than the captures, begin with an image by `AdmmTV`.
+    by itself. Several planes, and fields with as many pixels as the captures, begin with `AdmmTV`.
     What the denoiser has not learned, such as fine texture, may be lost, and what looks like an
     edge be made up.
 
@@ -217,7 +217,7 @@ class PlugAndPlay(AbstractIterativeSolver):
             warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
             first = AdmmTV(tau, iterations=_ITERATIONS, **options).solve(recording)
         image = first_image(problem, recording.oriented(first.image), uniform=True)
-        for run, own in zip(runs, _split(image, [run.given for run in runs]), strict=True):
+        for run, own in zip(runs, _split(image, [run.problem for run in runs]), strict=True):
             run.begin(own, warm=True, fitted=True)
         if first.status == "interrupted":
             raise KeyboardInterrupt
@@ -236,8 +236,7 @@ class _Run:
         warm: bool,
     ):
         scaled = ScaledProblem(problem, iterations=_UNIT)
-        self.solver, self.given = solver, problem
-        self.problem, self.unit = scaled.problem, scaled.image_unit
+        self.solver, self.problem, self.unit = solver, scaled.problem, scaled.image_unit
         # 1/variance of a capture in these units, as it was given.
         self.given_precision = scaled.curvature * scaled.image_unit**2
         self.normal = _normal(scaled.problem, jnp.ones_like(self.given_precision), like)
@@ -251,7 +250,7 @@ class _Run:
         Of one that is `fitted` to the captures, a data step with less s shows the noise.
         """
         self.result, self.image = image, image / self.unit
-        seen = brightness(self.image) if warm else jnp.max(uniform_image(self.given)) / self.unit
+        seen = brightness(self.image) if warm else jnp.max(uniform_image(self.problem))
         self.largest = or_one(_FIRST * seen)
         self.course = course(self.solver.iterations, _WARM if warm else 1.0)
         self.precision = self.given_precision
