@@ -19,7 +19,7 @@ import math
 import os
 import time
 import warnings
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
+from thincam_jax.learn.residual_noise import ResidualNoise, residual_noise
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
 from thincam_jax.reconstruction.methods import AdmmTV, starts_uniform
@@ -50,7 +51,6 @@ from thincam_jax.reconstruction.problem import (
     detector_shape,
     misfit,
     or_one,
-    residuals,
     uniform_image,
 )
 from thincam_jax.reconstruction.recording import Recording
@@ -63,9 +63,10 @@ from thincam_jax.reconstruction.solver import (
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# s falls from twice the brightness of the image to a 24th of it; given a start, from a quarter of
-# that. From once the brightness dark images at 20 dB stay 1.5 dB below.
-_FIRST, _LAST, _WARM = 2, 1 / 48, 1 / 4
+# s falls from twice the brightness of the image to a 24th of it; given a start, from 0.8 of twice
+# its root mean square, which is a third of the brightness of a picture in a dark room. From once
+# the brightness dark images at 20 dB stay 1.5 dB below.
+_FIRST, _LAST, _WARM = 2, 1 / 48, 0.8
 # Width of the rings, cycles per pixel. Narrower ones gain less. Wider ones leave noise in a band:
 # method A loses 0.3 dB of a photograph with rings four times as wide, 3 dB with the mean of all.
 _RING = 1 / 64
@@ -91,9 +92,6 @@ _STEP_ERROR = 0.03
 # as of captures with over 45 dB in single precision, they are not solved, and images explode.
 _LEAST_SHIFT = 64
 _UNIT = 4  # steps of the power method for a unit, which needs to be no closer than that
-_LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
-_LEAST_SHARE = 0.02  # of the noise, that the first data step leaves, by which it can be found
-_PARTS, _SMALLEST = 3, 8  # along each side of a capture, and the pixels that such a part has
 
 
 def as_denoiser(denoiser: Any) -> Any:
@@ -160,7 +158,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ):
-        """Reconstruct; with a start image s begins at a quarter of its usual value."""
+        """Reconstruct; with a start image s begins at 0.8 of twice its root mean square."""
         began = time.perf_counter()
         apart = TotalVariation(coupling="none")  # colours
         problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
@@ -174,10 +172,13 @@ class PlugAndPlay(AbstractIterativeSolver):
         status: Status = "iterations_exhausted"
         runs: list[_Run] = []
         try:
+            slow = start is None and _is_slow(problem)
+            kind = "passing" if slow else "far" if start is None else "near"
             for part, image in zip(parts, images, strict=True):
-                like = runs[0].normal if runs else None
-                runs.append(_Run(self, part, image, like, warm=start is not None))
-            if start is None and _is_slow(problem):
+                run = _Run(self, part, runs[0].given if runs else None)
+                run.begin(image, kind)
+                runs.append(run)
+            if slow:
                 self._begin_smooth(recording, problem, runs)
             for number in range(self.iterations + _FURTHER + 1):
                 for run in runs:
@@ -218,7 +219,7 @@ class PlugAndPlay(AbstractIterativeSolver):
             first = AdmmTV(tau, iterations=_ITERATIONS, **options).solve(recording)
         image = first_image(problem, recording.oriented(first.image), uniform=True)
         for run, own in zip(runs, _split(image, [run.problem for run in runs]), strict=True):
-            run.begin(own, warm=True, fitted=True)
+            run.begin(own, "fitted")
         if first.status == "interrupted":
             raise KeyboardInterrupt
 
@@ -226,39 +227,57 @@ class PlugAndPlay(AbstractIterativeSolver):
 class _Run:
     """The iteration of one image: `result` is the last finite one, `mistake` that of the noise."""
 
-    def __init__(
-        self,
-        solver: PlugAndPlay,
-        problem: InverseProblem,
-        image: Image,
-        like: AbstractNormal | None,
-        *,
-        warm: bool,
-    ):
+    def __init__(self, solver: PlugAndPlay, problem: InverseProblem, like: AbstractNormal | None):
         scaled = ScaledProblem(problem, iterations=_UNIT)
-        self.solver, self.problem, self.unit = solver, scaled.problem, scaled.image_unit
-        # 1/variance of a capture in these units, as it was given.
+        self.solver, self.unit = solver, scaled.image_unit
+        # 1/variance of a capture in these units, and the weights, as they were given.
         self.given_precision = scaled.curvature * scaled.image_unit**2
-        self.normal = _normal(scaled.problem, jnp.ones_like(self.given_precision), like)
-        self.right = back_projected(scaled.problem, scaled.problem.captures)
-        self.begin(image, warm=warm)
+        self.given = _normal(scaled.problem, jnp.ones_like(self.given_precision), like)
         self.misfit = self.gap = self.change = math.nan
 
-    def begin(self, image: Image, *, warm: bool, fitted: bool = False) -> None:
-        """The first data step, and the noise, from an image that is near to the one sought or not.
+    def begin(self, image: Image, kind: Literal["far", "near", "fitted", "passing"]) -> None:
+        """The first data step, and the noise, from an image far from the one sought, or near it.
 
-        Of one that is `fitted` to the captures, a data step with less s shows the noise.
+        Of one that is "fitted" to the captures, a data step with less s shows the noise. A
+        "passing" beginning finds no more than that for another one.
         """
+        warm = kind in ("near", "fitted")
+        self._take(self.given)
         self.result, self.image = image, image / self.unit
         seen = brightness(self.image) if warm else jnp.max(uniform_image(self.problem))
         self.largest = or_one(_FIRST * seen)
-        self.course = course(self.solver.iterations, _WARM if warm else 1.0)
+        size = float(or_one(jnp.sqrt(jnp.mean(self.image**2))) / or_one(seen))
+        self.course = course(self.solver.iterations, max(_WARM * size, _LAST) if warm else 1.0)
         self.precision = self.given_precision
-        self._step(self.largest * (_FITTED if fitted else self.course[0]))
-        mistake = noise_mistake(self.normal, self.found, self.shift, self.precision)
-        self.mistake, self.precision = float(mistake), self.precision / mistake**2
-        if fitted:
+        self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]))
+        noise = self._noise()
+        self.mistake = float(noise.mistake)
+        weighted = kind != "passing" and bool(noise.grows)
+        if weighted:
+            self._weigh(noise.variances)
+            self._step(self.s)
+            noise = self._noise()
+        self.precision = self.precision / noise.mistake**2
+        if kind == "fitted" or weighted:
             self._step(self.largest * self.course[0])
+
+    @property
+    def problem(self) -> InverseProblem:
+        """In units of which A has the norm 1."""
+        return self.normal.problem
+
+    def _noise(self) -> ResidualNoise:
+        return residual_noise(self.normal, self.found, self.shift, self.precision)
+
+    def _weigh(self, variances: tuple[Array, ...]) -> None:
+        """Weights of pixels by their variances."""
+        pairs = zip(self.problem.weights, variances, strict=True)
+        weights = tuple(w / v for w, v in pairs)
+        weighted = eqx.tree_at(lambda p: p.weights, self.problem, weights)
+        self._take(normal_equations(weighted, self.shift))
+
+    def _take(self, normal: AbstractNormal) -> None:
+        self.normal, self.right = normal, back_projected(normal.problem, normal.problem.captures)
 
     def advance(self, number: int) -> None:
         """Data step, but for the first one, and denoiser."""
@@ -361,66 +380,9 @@ def _normal(
     return normal_equations(problem, shift)
 
 
-@eqx.filter_jit
-def noise_mistake(
-    normal: AbstractNormal, found: Image, shift: Float[Array, ""], precision: Float[Array, ""]
-) -> Float[Array, ""]:
-    r"""Deviation of the noise in the residual of z over the one given, where there is most of it.
-
-    Of the residual in each part of the captures, over that of white noise of the deviation given,
-    which the data step is tried on: shot noise is strongest where the captures are bright, and so
-    are the object's rays. 1 where that leaves too little noise to tell.
-    """
-    problem = normal.problem
-    keys = jax.random.split(jax.random.key(0), len(problem.captures))
-    drawn = tuple(
-        jnp.where(w > 0, jax.random.normal(key, c.shape, c.dtype) / jnp.sqrt(or_one(w)), 0)
-        for key, c, w in zip(keys, problem.captures, problem.weights, strict=True)
-    )
-    white = eqx.tree_at(lambda p: p.captures, problem, drawn)
-    fitted = _roughly(normal.shifted(shift), back_projected(white, drawn))
-    seen, known = (_local_power(p, image) for p, image in ((problem, found), (white, fitted)))
-    ratios = jnp.where(known > _LEAST_SHARE, precision * seen / or_one(known), 0)
-    most = jnp.sqrt(jnp.max(ratios))
-    trusted = (most > 0) & jnp.isfinite(most)
-    return jnp.where(trusted, jnp.clip(most, 1 / _LARGEST_MISTAKE, _LARGEST_MISTAKE), 1)
-
-
-def _local_power(problem: InverseProblem, image: Image) -> Array:
-    """Means of w (A f − g)² over captures and their parts, of _PARTS along each axis.
-
-    Pixels are averaged with their neighbours before, since captures that were interpolated, such as
-    those of two distances, have next to none of their noise at high frequencies.
-    """
-    means = []
-    for r, w, o in zip(residuals(problem, image), problem.weights, problem.operators, strict=True):
-        left, sides = jnp.sqrt(w) * r, detector_shape(o)
-        if min(sides) < _SMALLEST * _PARTS:
-            means.append(jnp.mean(left**2))
-            continue
-        for axis in range(-len(sides), 0):
-            left = jnp.moveaxis(left, axis, 0)
-            left = jnp.moveaxis((left[1:] + left[:-1]) / 2, 0, axis)
-        power = left**2
-        for axis in range(-len(sides), 0):
-            power = jnp.moveaxis(power, axis, 0)
-            power = power[: len(power) // _PARTS * _PARTS]
-            power = power.reshape(_PARTS, -1, *power.shape[1:]).mean(axis=1)
-            power = jnp.moveaxis(power, 0, axis)
-        means.append(power.mean(axis=tuple(range(power.ndim - len(sides)))))
-    return sum(means[1:], start=means[0]) / len(means)
-
-
 def _signs(normal: AbstractNormal) -> Image:
     shape, dtype = normal.problem.image_shape, normal.problem.captures[0].dtype
     return jax.random.rademacher(jax.random.key(0), shape, dtype)
-
-
-def _roughly(normal: AbstractNormal, right: Image) -> Image:
-    """The solution to 5 %, which suffices for a mean over all modes."""
-    if not isinstance(normal, IterativeNormal):
-        return normal.solve(right)
-    return normal.solution(right, jnp.zeros_like(right), 5e-2, INNER_STEPS).value
 
 
 @eqx.filter_jit

@@ -1,0 +1,131 @@
+"""Noise of captures, found from what a data step leaves of them.
+
+The residual's power in parts of the captures, over that of white noise on which the same data step
+is tried, is the variance there. That of light grows with it: a + b·light, by which each pixel is
+weighted, since a mean over the sensor tells too little in bright parts and too much in dark ones.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from thincam_jax.reconstruction.normal_equations import INNER_STEPS, AbstractNormal, IterativeNormal
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    back_projected,
+    convolutions,
+    detector_shape,
+    forward,
+    or_one,
+)
+from thincam_jax.reconstruction.regularisers import Image
+
+_LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
+_LEAST_SHARE = 0.02  # of the noise, that the data step leaves, by which it can be found
+_PARTS, _SMALLEST = 3, 8  # along each side of a capture, and the pixels that such a part has
+# Pixels are weighted where the variance differs from part to part by such a factor, as that of
+# uniform noise seems to by 1.1, or what is left of an object at 40 dB by 2; and where a + b·light
+# explains it to such a part: the last does so to 0.2 to 2.
+_CONTRAST, _UNEXPLAINED = 1.4, 0.15
+_LEAST_VARIANCE = 0.1  # of a pixel, over that of one of mean light
+
+
+class ResidualNoise(eqx.Module):
+    """Noise of captures, relative to the one given.
+
+    - `mistake`: its deviation where there is most of it, as in bright parts; 1 where the data step
+      leaves too little to tell.
+    - `grows`: whether it grows with the light, and `variances`: of each pixel, over that of one of
+      mean light; False and none where the operators are no convolutions, or captures small.
+    """
+
+    mistake: Float[Array, ""]
+    grows: Bool[Array, ""]
+    variances: tuple[Float[Array, "..."], ...]
+
+
+@eqx.filter_jit
+def residual_noise(
+    normal: AbstractNormal, found: Image, shift: Float[Array, ""], precision: Float[Array, ""]
+) -> ResidualNoise:
+    """From the residual of z, a data step with μ = `shift` and 1/variance = `precision`."""
+    problem = normal.problem
+    keys = jax.random.split(jax.random.key(0), len(problem.captures))
+    drawn = tuple(
+        jnp.where(w > 0, jax.random.normal(key, c.shape, c.dtype) / jnp.sqrt(or_one(w)), 0)
+        for key, c, w in zip(keys, problem.captures, problem.weights, strict=True)
+    )
+    white = eqx.tree_at(lambda p: p.captures, problem, drawn)
+    fitted = _roughly(normal.shifted(shift), back_projected(white, drawn))
+    seen, known = (_residual_power(p, image) for p, image in ((problem, found), (white, fitted)))
+    variance = jnp.where(known > _LEAST_SHARE, precision * seen / or_one(known), 0)
+    most = jnp.sqrt(jnp.max(variance))
+    trusted = (most > 0) & jnp.isfinite(most)
+    mistake = jnp.where(trusted, jnp.clip(most, 1 / _LARGEST_MISTAKE, _LARGEST_MISTAKE), 1)
+    if convolutions(problem) is None or variance.ndim == 0:
+        return ResidualNoise(mistake, jnp.asarray(False), ())
+    light = [jnp.maximum(forward(o, found), 0) for o in problem.operators]
+    return ResidualNoise(mistake, *_growth(variance, light))
+
+
+def _growth(
+    variance: Float[Array, "part part"], light: list[Float[Array, "..."]]
+) -> tuple[Bool[Array, ""], tuple[Float[Array, "..."], ...]]:
+    """Whether a + b·light explains the variance of parts, and what it gives for each pixel."""
+    light = [one / or_one(jnp.mean(one)) for one in light]  # a bright capture's noise is known
+    parts = _means_of_parts(light, [2] * len(light))
+    # Least squares, neither a nor b negative.
+    away = parts - jnp.mean(parts)
+    slope = jnp.maximum(jnp.sum(away * variance) / or_one(jnp.sum(away**2)), 0)
+    base = jnp.mean(variance) - slope * jnp.mean(parts)
+    through = jnp.sum(parts * variance) / or_one(jnp.sum(parts**2))
+    base, slope = jnp.maximum(base, 0), jnp.where(base > 0, slope, through)
+    fitted = base + slope * parts
+    differs = jnp.max(fitted) > _CONTRAST * jnp.min(fitted)
+    explained = jnp.std(variance / or_one(fitted)) < _UNEXPLAINED
+    each = [(base + slope * one) / or_one(base + slope) for one in light]
+    return differs & explained, tuple(jnp.maximum(one, _LEAST_VARIANCE) for one in each)
+
+
+def _residual_power(problem: InverseProblem, image: Image) -> Array:
+    """Means of w (A f − g)² over captures and their parts, of _PARTS along each axis.
+
+    Pixels are averaged with their neighbours before, since captures that were interpolated, such as
+    those of two distances, have next to none of their noise at high frequencies.
+    """
+    powers, lengths = [], []
+    parts = zip(problem.operators, problem.captures, problem.weights, strict=True)
+    for o, capture, w in parts:
+        left, sides = jnp.sqrt(w) * (forward(o, image) - capture), detector_shape(o)
+        if min(sides) >= _SMALLEST * _PARTS:
+            for axis in range(-len(sides), 0):
+                left = jnp.moveaxis(left, axis, 0)
+                left = jnp.moveaxis((left[1:] + left[:-1]) / 2, 0, axis)
+        powers.append(left**2)
+        lengths.append(len(sides))
+    return _means_of_parts(powers, lengths)
+
+
+def _means_of_parts(captures: list[Array], axes: list[int]) -> Array:
+    """Over the captures and their batch, of _PARTS along each of the last axes; of small captures
+    over all."""
+    means = []
+    for capture, count in zip(captures, axes, strict=True):
+        if min(capture.shape[-count:]) < _SMALLEST * _PARTS - 1:
+            means.append(jnp.mean(capture))
+            continue
+        for axis in range(-count, 0):
+            capture = jnp.moveaxis(capture, axis, 0)
+            capture = capture[: len(capture) // _PARTS * _PARTS]
+            capture = capture.reshape(_PARTS, -1, *capture.shape[1:]).mean(axis=1)
+            capture = jnp.moveaxis(capture, 0, axis)
+        means.append(capture.mean(axis=tuple(range(capture.ndim - count))))
+    return sum(means[1:], start=means[0]) / len(means)
+
+
+def _roughly(normal: AbstractNormal, right: Image) -> Image:
+    """The solution to 5 %, which suffices for a mean over all modes."""
+    if not isinstance(normal, IterativeNormal):
+        return normal.solve(right)
+    return normal.solution(right, jnp.zeros_like(right), 5e-2, INNER_STEPS).value
