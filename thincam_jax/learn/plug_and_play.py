@@ -64,9 +64,9 @@ from thincam_jax.reconstruction.solver import (
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 # s falls from twice the brightness of the image to a 24th of it; given a start, from 0.8 of twice
-# its root mean square, which is a third of the brightness of a picture in a dark room. From once
-# the brightness dark images at 20 dB stay 1.5 dB below.
-_FIRST, _LAST, _WARM = 2, 1 / 48, 0.8
+# its root mean square, but a quarter of the first at least, as in a dark room. From once the
+# brightness dark images at 20 dB stay 1.5 dB below.
+_FIRST, _LAST, _WARM, _LEAST_WARM = 2, 1 / 48, 0.8, 1 / 4
 # Width of the rings, cycles per pixel. Narrower ones gain less. Wider ones leave noise in a band:
 # method A loses 0.3 dB of a photograph with rings four times as wide, 3 dB with the mean of all.
 _RING = 1 / 64
@@ -158,7 +158,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ):
-        """Reconstruct; with a start image s begins at 0.8 of twice its root mean square."""
+        """Reconstruct; with a start image s begins lower, by its root mean square."""
         began = time.perf_counter()
         apart = TotalVariation(coupling="none")  # colours
         problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
@@ -246,8 +246,9 @@ class _Run:
         self.result, self.image = image, image / self.unit
         seen = brightness(self.image) if warm else jnp.max(uniform_image(self.problem))
         self.largest = or_one(_FIRST * seen)
-        size = float(or_one(jnp.sqrt(jnp.mean(self.image**2))) / or_one(seen))
-        self.course = course(self.solver.iterations, max(_WARM * size, _LAST) if warm else 1.0)
+        spread = float(jnp.sqrt(jnp.mean(self.image**2)) / or_one(seen))
+        first = max(_WARM * spread, _LEAST_WARM) if warm else 1.0
+        self.course = course(self.solver.iterations, first)
         self.precision = self.given_precision
         self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]))
         noise = self._noise()
