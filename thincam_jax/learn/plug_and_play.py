@@ -63,10 +63,10 @@ from thincam_jax.reconstruction.solver import (
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# s falls from twice the brightness of the image to a 24th of it; given a start, from 0.8 of twice
+# s falls from twice the brightness of the image to a 24th of it; given a start, from 0.6 of twice
 # its root mean square, but a quarter of the first at least, as in a dark room. From once the
 # brightness dark images at 20 dB stay 1.5 dB below.
-_FIRST, _LAST, _WARM, _LEAST_WARM = 2, 1 / 48, 0.8, 1 / 4
+_FIRST, _LAST, _WARM, _LEAST_WARM = 2, 1 / 48, 0.6, 1 / 4
 # Width of the rings, cycles per pixel. Narrower ones gain less. Wider ones leave noise in a band:
 # method A loses 0.3 dB of a photograph with rings four times as wide, 3 dB with the mean of all.
 _RING = 1 / 64
