@@ -79,15 +79,15 @@ FINAL = 0.25
 # that ends them: three times the noise. They halve the residual of bright captures, and gain no
 # more below.
 _FALL, _FURTHER, _EXPLAINED = 0.58, 8, 10
-# Weight and iterations of the image by total variation from which several planes begin, and fields
-# with as many pixels as the captures: what captures hardly show takes too many data steps. It gains
-# a dark room at 40 dB up to 15 dB. Half of the iterations lose planes 1 dB.
-_TAU, _ITERATIONS = 1.0, 100
+# Weight, iterations and tolerance of the image by total variation from which several planes begin,
+# and fields with as many pixels as the captures: what captures hardly show takes too many data
+# steps. It gains a dark room at 40 dB up to 15 dB. Half of the iterations lose planes 1 dB.
+_TAU, _ITERATIONS, _TOLERANCE = 1.0, 100, 1e-3
 # s, relative to the first, that shows the noise of that image: dark rooms explain any noise with
 # more, and with less what total variation takes from planes at 40 dB counts as noise.
 _FITTED = 0.15
 # Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
-_STEP_ERROR = 0.03
+_STEP_ERROR = 0.05
 # Least μ of the normal equations, in units of the precision's rounding, where ‖A‖ = 1: with less,
 # as of captures with over 45 dB in single precision, they are not solved, and images explode.
 _LEAST_SHIFT = 64
@@ -213,14 +213,20 @@ class PlugAndPlay(AbstractIterativeSolver):
     def _begin_smooth(self, recording: Recording, problem: InverseProblem, runs: list["_Run"]):
         """Begin the runs with images by total variation of the noise that was found."""
         tau = _TAU * max(run.mistake for run in runs)
-        options = {"nonnegative": self.nonnegative, "synthesis": self.synthesis}
+        first = AdmmTV(
+            tau,
+            nonnegative=self.nonnegative,
+            synthesis=self.synthesis,
+            iterations=_ITERATIONS,
+            tolerance=_TOLERANCE,
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
-            first = AdmmTV(tau, iterations=_ITERATIONS, **options).solve(recording)
-        image = first_image(problem, recording.oriented(first.image), uniform=True)
+            begun = first.solve(recording)
+        image = first_image(problem, recording.oriented(begun.image), uniform=True)
         for run, own in zip(runs, _split(image, [run.problem for run in runs]), strict=True):
             run.begin(own, "fitted")
-        if first.status == "interrupted":
+        if begun.status == "interrupted":
             raise KeyboardInterrupt
 
 
@@ -259,7 +265,7 @@ class _Run:
             self._step(self.s)
             noise = self._noise()
         self.precision = self.precision / noise.mistake**2
-        if kind == "fitted" or weighted:
+        if kind == "fitted":
             self._step(self.largest * self.course[0])
 
     @property
