@@ -317,7 +317,7 @@ def least_gain(name, noise):
     """What 24 photographs are to gain on average; of a few, that they do not lose."""
     if COUNT < 24:
         return -0.1
-    if noise.endswith("e"):
+    if noise.endswith("e") and "quarter" in name:
         return 0.1
     return 0.8 if "mm" in name else 0.4
 
