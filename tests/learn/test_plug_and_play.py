@@ -239,6 +239,9 @@ def test_start_callback_and_status():
     easy = tc.PlugAndPlay(smooth, iterations=5, tolerance=0.9)
     ended = tc.reconstruct(seen, easy, start=jnp.asarray(scene()))
     assert ended.status == "converged" and ended.iterations == 5
+    # A dark start tells nothing: none of its steps are smaller for it.
+    begun, alone = (tc.reconstruct(seen, solver, start=s) for s in (jnp.zeros((1, *FIELD)), None))
+    np.testing.assert_array_equal(begun.image, alone.image)
 
     # What a denoiser takes from a bright capture is given back by further steps.
     def less(image, sigma):

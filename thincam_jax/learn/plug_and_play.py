@@ -158,22 +158,24 @@ class PlugAndPlay(AbstractIterativeSolver):
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ):
-        """Reconstruct; with a start image s begins lower, by its root mean square."""
+        """Reconstruct; with a start image that is not dark s begins lower."""
         began = time.perf_counter()
         apart = TotalVariation(coupling="none")  # colours
         problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
         parts = _parts(problem)
         bright = 1.0 if starts_uniform(recording, problem) else 0.0
         images = [bright * uniform_image(part) for part in parts]
+        warm = False
         if start is not None:
             image = first_image(problem, recording.oriented(start), uniform=True)
-            images = _split(image, parts)
+            warm = bool(jnp.any(image > 0))
+            images = _split(image, parts) if warm else images
         history: list[Progress] = []
         status: Status = "iterations_exhausted"
         runs: list[_Run] = []
         try:
-            slow = start is None and _is_slow(problem)
-            kind = "passing" if slow else "far" if start is None else "near"
+            slow = not warm and _is_slow(problem)
+            kind = "passing" if slow else "near" if warm else "far"
             for part, image in zip(parts, images, strict=True):
                 run = _Run(self, part, runs[0].given if runs else None)
                 run.begin(image, kind)
