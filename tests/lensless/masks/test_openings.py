@@ -111,3 +111,7 @@ def test_masks_from_pictures(tmp_path):
         with pytest.raises(ValueError, match=message) as error:
             tc.read_mask(path, 0.03)
         assert "\n" not in str(error.value)
+    wide = written("wide.png", np.eye(400) * 255)
+    with pytest.raises(ValueError, match=r"mask 1920 mm wide; .*: 0.012 for a mask 4.8 mm wide"):
+        tc.read_mask(wide, 4.8)
+    assert tc.read_mask(wide, 0.012).amplitude.shape == (400, 400)

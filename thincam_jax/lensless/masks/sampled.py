@@ -25,6 +25,8 @@ from thincam_jax.lensless.masks.base import (
 )
 from thincam_jax.lensless.masks.cells import cell_edges
 
+_WIDEST = 1000.0  # mm, of a mask from an image
+
 
 def _amplitudes(given: Any) -> Transmittance:
     amplitude = checks.array("amplitude", given, allow_complex=True)
@@ -180,7 +182,8 @@ def read_mask(path: str | os.PathLike[str], cell: Number) -> SampledMask:
     """A mask from a grey image: one cell a pixel, white open, a level in proportion to |t|².
 
     **Errors**: FileNotFoundError; ValueError, one line, for a file that is no image, for one with
-    colours and for one that lets no light pass.
+    colours, for one that lets no light pass, and for a mask over a metre wide, as where `cell` is
+    the mask's width.
 
     ```python
     import numpy as np
@@ -202,4 +205,11 @@ def read_mask(path: str | os.PathLike[str], cell: Number) -> SampledMask:
     levels = levels if levels.ndim == 2 else levels[..., 0]
     if not levels.any():
         raise ValueError(f"{str(path)!r} is black: no light passes; paint what is open white")
-    return SampledMask(np.sqrt(levels), cell)
+    mask = SampledMask(np.sqrt(levels), cell)
+    if not checks.is_traced(mask.pitch) and levels.shape[1] * float(mask.pitch) > _WIDEST:
+        pitch, count = float(mask.pitch), levels.shape[1]
+        raise ValueError(
+            f"cell = {pitch:g} mm makes a mask {count * pitch:.0f} mm wide; give the side of one "
+            f"pixel of the image: {pitch / count:.3g} for a mask {pitch:g} mm wide"
+        )
+    return mask
