@@ -132,7 +132,8 @@ def reference_page(package: str, seen: set[tuple[str, str]]) -> str:
             for alias in (one for one in node.names if one.asname):  # `x as x`: public
                 module = f"{package}.{node.module}" if node.level else node.module
                 named = getattr(importlib.import_module(package), alias.name)
-                module = getattr(named, "__module__", module)
+                made_in = getattr(named, "__module__", module)  # "typing" of an alias of types
+                module = made_in if made_in.startswith(TOP) else module
                 if (module, alias.name) not in seen:
                     seen.add((module, alias.name))
                     groups.setdefault(heading(package, module), []).append(alias.name)

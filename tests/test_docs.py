@@ -410,6 +410,20 @@ def public(module: str, name: str) -> bool:
     return module in packages or f"{module}.{name}" in packages
 
 
+def test_the_reference_names_what_packages_export(tmp_path):
+    """By the program of docs/conf.py itself, in a folder beside the package."""
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "thincam_jax").symlink_to(ROOT / "thincam_jax")
+    program = tmp_path / "docs/conf.py"
+    program.write_text((ROOT / "docs/conf.py").read_text("utf-8"), "utf-8")
+    runpy.run_path(str(program))
+    pages = {page.stem: page.read_text("utf-8") for page in (tmp_path / "docs/api").iterdir()}
+    packages = assigned("PACKAGES")
+    assert isinstance(packages, ast.Tuple) and len(pages) == len(packages.elts)
+    assert "   PlugAndPlay\n" in pages["thincam_jax"]
+    assert "   residual_noise\n" not in "".join(pages.values())
+
+
 USERS = [path.read_text("utf-8") for path in sorted((ROOT / "experiments").glob("*.py"))]
 USERS += [
     "\n".join(re.findall(r"```py(?:thon)?\n(.*?)```", page, re.DOTALL)) for page in pages().values()

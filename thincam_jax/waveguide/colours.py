@@ -144,7 +144,7 @@ class ColourCamera(Module):
         return jax.vmap(one)(jnp.arange(len(self.cameras)), self.gratings.grating)
 
     def coupled(self, guided: Float[Array, "*ray 2"], wavelength: Float[Array, "*ray"]):
-        """C of each, (grating, 2, *ray) for TE and TM, what stays guided, and **t**_k."""
+        """C of each, (grating, 2, *ray) for TE and TM, what stays guided, and directions t_k."""
         films, turns = self.gratings, wavelength[..., None] / (2 * jnp.pi)
         outside = jax.vmap(lambda grating: guided + turns * grating[:2])(films.grating)
         own = jax.vmap(_eta, (0, 0, None))(films, outside, wavelength)
