@@ -25,7 +25,7 @@ _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
 _LEAST_SHARE = 0.02  # of the noise, that the data step leaves, by which it can be found
 _PARTS, _SMALLEST = 3, 8  # along each side of a capture, and the pixels that such a part has
 # Pixels are weighted where the variance differs from part to part by such a factor, as that of
-# uniform noise seems to by 1.1, or what is left of an object at 40 dB by 2; and where a + b·light
+# uniform noise seems to by 1.2, or what is left of an object at 40 dB by 2; and where a + b·light
 # explains it to such a part: the last does so to 0.2 to 2.
 _CONTRAST, _UNEXPLAINED = 1.4, 0.15
 _LEAST_VARIANCE = 0.1  # of a pixel, over that of one of mean light
