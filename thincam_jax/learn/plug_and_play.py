@@ -111,7 +111,8 @@ class PlugAndPlay(AbstractIterativeSolver):
     """Least squares with a trained denoiser as its prior; any camera, crop included.
 
     Nothing is to be tuned. The noise is taken as the recording tells, corrected by up to four times
-    where the residual of the first data step is another. Each image, colour and plane is denoised
+    where the residual of the first data step is another; pixels are weighted where it grows with
+    the light, as photon noise does, behind convolutions. Each image, colour and plane is denoised
     by itself. Several planes, and fields with as many pixels as the captures, begin with `AdmmTV`.
     What the denoiser has not learned, such as fine texture, may be lost, and what looks like an
     edge be made up.
