@@ -71,6 +71,16 @@ mosaic = full[1].copy()
 mosaic[:, ::2, ::2], mosaic[:, 1::2, 1::2] = full[0, :, ::2, ::2], full[2, :, 1::2, 1::2]
 interpolated = np.stack([measured.demosaic(frame, "RGGB") for frame in mosaic])
 
+figure, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
+for ax, part in zip(axes, (mosaic[0], mosaic[0, :24, :32]), strict=True):
+    ax.imshow(part, cmap="gray", extent=(0, part.shape[1] * pitch, part.shape[0] * pitch, 0))
+    ax.set(xlabel="x on the sensor (mm)", ylabel="y on the sensor (mm)")
+axes[0].set_title("mosaic of the first phase")
+axes[1].set_title("its corner: colours differ from pixel to pixel")
+figure.savefig(FIGURES / "mosaic.png", dpi=90)
+
+# %%
+
 
 def image(frames, model, share=1.0):
     """By a Wiener filter; `share` of the pixels see the colour."""
