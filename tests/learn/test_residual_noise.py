@@ -34,10 +34,10 @@ def test_noise_that_was_told_wrongly_is_found(wrong):
     assert abs(float(noise_of(seen, 1e-4).mistake) / wrong - 1) < 0.2
 
 
-def zone_aperture():
+def zone_aperture(share: float = 1.0):
     y, x = np.indices((63, 71)) - np.array([31, 35])[:, None, None]
     psf = (1 + np.cos(0.04 * (y**2 + x**2))) * (np.hypot(y, x) < 31)
-    return CropConvolution(jnp.asarray(psf / psf.sum()), 1.0, (130, 142), (64, 70))
+    return CropConvolution(jnp.asarray(share * psf / psf.sum()), 1.0, (130, 142), (64, 70))
 
 
 def scene():
@@ -65,6 +65,21 @@ def test_noise_that_grows_with_the_light_is_found_for_each_pixel(background):
     np.testing.assert_allclose(found[bright].mean(), expected[bright].mean(), rtol=0.05)
     assert np.std(found[bright] / expected[bright]) < 0.1
     assert found.min() >= 0.1 - 1e-12
+
+
+def test_a_capture_of_more_light_keeps_its_own_noise():
+    """Given for each capture, the noise of the brighter one is not taken for more than that."""
+    one, bright = zone_aperture(), zone_aperture(3.0)
+    captures, given = [], []
+    for seed, A in enumerate((one, bright)):
+        variance = light(A) * light(one).mean() / 100
+        drawn = np.random.default_rng(seed).normal(size=variance.shape)
+        captures.append(light(A) + np.sqrt(variance) * drawn)
+        given.append(float(variance.mean()))
+    noise = noise_of(tc.Recording(captures, [one, bright], noise_variance=given), 1e-3)
+    assert noise.grows
+    for found in noise.variances:
+        np.testing.assert_allclose(float(found.mean()), 1, atol=0.1)
 
 
 def test_uniform_noise_does_not_grow_with_the_light():
@@ -99,10 +114,7 @@ def test_the_noise_is_that_of_the_noisiest_part():
     deviation[48:96, 52:104] *= 3
     noise = deviation * rng.normal(size=deviation.shape)
     capture = np.asarray(A(jnp.asarray(rng.random((24, 26))))) + noise
-    problem = tc.Recording(jnp.asarray(capture), A, noise_variance=SIGMA**2).problem()
-    normal = normal_equations(problem, jnp.ones(()))
-    found = normal.solve(back_projected(problem, problem.captures))
-    noise = residual_noise(normal, found, normal.shift, jnp.ones(()))
+    noise = noise_of(tc.Recording(jnp.asarray(capture), A, noise_variance=SIGMA**2), 1e-3)
     assert abs(float(noise.mistake) / 3 - 1) < 0.1
     assert not noise.grows
 
@@ -115,8 +127,4 @@ def test_the_noise_of_enlarged_captures_is_found():
     model = tc.Cameras(cameras, wavelength=5e-4, object_distance=200.0, field_shape=(24, 28))
     noise = rng.normal(size=(2, *sensor.shape))
     seen = tc.Recording(list(SIGMA * noise), model, noise_variance=SIGMA**2)
-    scaled = ScaledProblem(seen.problem())
-    problem, precision = scaled.problem, scaled.curvature * scaled.image_unit**2
-    normal = normal_equations(problem, jnp.asarray(0.1))
-    found = normal.solve(back_projected(problem, problem.captures))
-    assert 0.97 < float(residual_noise(normal, found, normal.shift, precision).mistake) < 1.1
+    assert 0.97 < float(noise_of(seen, 0.1).mistake) < 1.1

@@ -253,10 +253,13 @@ class _Run:
         warm = kind in ("near", "fitted")
         self._take(self.given)
         self.result, self.image = image, image / self.unit
-        seen = brightness(self.image) if warm else jnp.max(uniform_image(self.problem))
+        if warm:
+            seen = brightness(self.image)
+            spread = float(jnp.sqrt(jnp.mean(self.image**2)) / or_one(seen))
+            first = max(_WARM * spread, _LEAST_WARM)
+        else:
+            seen, first = jnp.max(uniform_image(self.problem)), 1.0
         self.largest = or_one(_FIRST * seen)
-        spread = float(jnp.sqrt(jnp.mean(self.image**2)) / or_one(seen))
-        first = max(_WARM * spread, _LEAST_WARM) if warm else 1.0
         self.course = course(self.solver.iterations, first)
         self.precision = self.given_precision
         self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]))

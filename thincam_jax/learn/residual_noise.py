@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax.imaging.operators import AbstractOperator
 from thincam_jax.reconstruction.normal_equations import INNER_STEPS, AbstractNormal, IterativeNormal
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
@@ -65,16 +66,16 @@ def residual_noise(
     mistake = jnp.where(trusted, jnp.clip(most, 1 / _LARGEST_MISTAKE, _LARGEST_MISTAKE), 1)
     if convolutions(problem) is None or variance.ndim == 0:
         return ResidualNoise(mistake, jnp.asarray(False), ())
-    light = [jnp.maximum(forward(o, found), 0) for o in problem.operators]
-    return ResidualNoise(mistake, *_growth(variance, light))
+    return ResidualNoise(mistake, *_growth(problem, found, variance))
 
 
 def _growth(
-    variance: Float[Array, "part part"], light: list[Float[Array, "..."]]
+    problem: InverseProblem, found: Image, variance: Float[Array, "part part"]
 ) -> tuple[Bool[Array, ""], tuple[Float[Array, "..."], ...]]:
     """Whether a + b·light explains the variance of parts, and what it gives for each pixel."""
+    light = [jnp.maximum(forward(o, found), 0) for o in problem.operators]
     light = [one / or_one(jnp.mean(one)) for one in light]  # a bright capture's noise is known
-    parts = _means_of_parts(light, [2] * len(light))
+    parts = _means_of_parts(problem, light)
     # Least squares, neither a nor b negative.
     away = parts - jnp.mean(parts)
     slope = jnp.maximum(jnp.sum(away * variance) / or_one(jnp.sum(away**2)), 0)
@@ -94,33 +95,36 @@ def _residual_power(problem: InverseProblem, image: Image) -> Array:
     Pixels are averaged with their neighbours before, since captures that were interpolated, such as
     those of two distances, have next to none of their noise at high frequencies.
     """
-    powers, lengths = [], []
+    powers = []
     parts = zip(problem.operators, problem.captures, problem.weights, strict=True)
     for o, capture, w in parts:
-        left, sides = jnp.sqrt(w) * (forward(o, image) - capture), detector_shape(o)
-        if min(sides) >= _SMALLEST * _PARTS:
-            for axis in range(-len(sides), 0):
+        left = jnp.sqrt(w) * (forward(o, image) - capture)
+        if _has_parts(o):
+            for axis in range(-len(detector_shape(o)), 0):
                 left = jnp.moveaxis(left, axis, 0)
                 left = jnp.moveaxis((left[1:] + left[:-1]) / 2, 0, axis)
         powers.append(left**2)
-        lengths.append(len(sides))
-    return _means_of_parts(powers, lengths)
+    return _means_of_parts(problem, powers)
 
 
-def _means_of_parts(captures: list[Array], axes: list[int]) -> Array:
-    """Over the captures and their batch, of _PARTS along each of the last axes; of small captures
-    over all."""
+def _has_parts(operator: AbstractOperator) -> bool:
+    return min(detector_shape(operator)) >= _PARTS * _SMALLEST
+
+
+def _means_of_parts(problem: InverseProblem, values: list[Array]) -> Array:
+    """Over captures, their batch and parts, _PARTS along each axis; over all of small captures."""
     means = []
-    for capture, count in zip(captures, axes, strict=True):
-        if min(capture.shape[-count:]) < _SMALLEST * _PARTS - 1:
-            means.append(jnp.mean(capture))
+    for operator, value in zip(problem.operators, values, strict=True):
+        if not _has_parts(operator):
+            means.append(jnp.mean(value))
             continue
+        count = len(detector_shape(operator))
         for axis in range(-count, 0):
-            capture = jnp.moveaxis(capture, axis, 0)
-            capture = capture[: len(capture) // _PARTS * _PARTS]
-            capture = capture.reshape(_PARTS, -1, *capture.shape[1:]).mean(axis=1)
-            capture = jnp.moveaxis(capture, 0, axis)
-        means.append(capture.mean(axis=tuple(range(capture.ndim - count))))
+            value = jnp.moveaxis(value, axis, 0)
+            value = value[: len(value) // _PARTS * _PARTS]
+            value = value.reshape(_PARTS, -1, *value.shape[1:]).mean(axis=1)
+            value = jnp.moveaxis(value, 0, axis)
+        means.append(value.mean(axis=tuple(range(value.ndim - count))))
     return sum(means[1:], start=means[0]) / len(means)
 
 
