@@ -3,6 +3,8 @@
 import io
 import json
 import re
+import shutil
+import subprocess
 import tomllib
 
 import jax
@@ -176,3 +178,40 @@ def test_the_module_of_the_widget_needs_no_build():
         "starlette",
         "uvicorn",
     }
+
+
+# A page without a browser: what is asked for comes when it is told to, and so do the ticks.
+STANDING = """
+import { mount } from "./explorer.mjs";
+const made = [], ticks = new Map();
+const node = () => ({ dataset: {}, classList: { toggle() {} }, addEventListener() {},
+                      appendChild(one) { made.push(one); return one; } });
+globalThis.document = { createElement: node, addEventListener() {} };
+globalThis.setTimeout = () => 0;
+globalThis.setInterval = (tick) => ticks.set(ticks.size + 1, tick).size;
+globalThis.clearInterval = (number) => ticks.delete(number);
+for (const live of [false, true]) {
+  let come;
+  mount(node(), [], () => new Promise((done) => { come = come ?? done; }), {}, live);
+  const [lines] = made.filter((one) => one.className === "tc-lines").slice(-1);
+  const told = [lines.textContent];
+  ticks.forEach((tick) => tick());
+  told.push(lines.textContent);
+  come([{ names: [], transfer: [], lines: ["PSNR 20 dB."], values: {} }, []]);
+  await new Promise(setImmediate);
+  console.log(JSON.stringify([...told, lines.textContent, live ? 1 : ticks.size]));
+}
+"""
+
+
+def test_the_page_says_that_it_computes_until_an_answer_comes(tmp_path):
+    node = shutil.which("node") or pytest.skip("node is not installed")
+    shutil.copy(MODULE, tmp_path / "explorer.mjs")
+    (tmp_path / "page.mjs").write_text(STANDING, "utf-8")
+    found = subprocess.run([node, "page.mjs"], cwd=tmp_path, capture_output=True, text=True)
+    assert not found.stderr
+    (before, *still), (_, *live) = map(json.loads, found.stdout.splitlines())
+    assert before is None
+    assert still[0].startswith("Computing… A first reconstruction is compiled")
+    assert live[0].startswith("Waiting for the next frame… ")
+    assert still[1] == live[1] == "PSNR 20 dB." and not still[2]

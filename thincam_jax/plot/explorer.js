@@ -123,7 +123,16 @@ export function mount(root, controls, request, captions = null, live = false) {
     shown[name] = element(name === "transfer" ? "canvas" : "img", figure, { alt: caption });
     element("figcaption", figure, { textContent: caption });
   }
-  const turn = scheduler(request, (header, blobs) => {
+  // What takes long is said until its answer comes.
+  const wait = live ? "Waiting for the next frame…" : "Computing…";
+  const told = `${wait} A first reconstruction is compiled, which can take a minute.`;
+  async function patient(values, rest) {
+    const pause = setInterval(() => {
+      if (lines.textContent !== told) lines.textContent = told;
+    }, live ? 3000 : 700);
+    return request(values, rest).finally(() => clearInterval(pause));
+  }
+  const turn = scheduler(patient, (header, blobs) => {
     header.names.forEach((name, index) => {
       URL.revokeObjectURL(addresses[name]);
       addresses[name] = URL.createObjectURL(blobs[index]);

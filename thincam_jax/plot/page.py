@@ -39,6 +39,13 @@ _POLICY = (
 )
 _HOST = "127.0.0.1"
 _LONGEST = 10_000  # bytes of a request
+_PATIENCE = 10.0  # s until a request is whole
+# Of every answer. A connection has one request, so that its time is that of the connection.
+_HEADERS = [
+    ("Connection", "close"),
+    ("Cache-Control", "no-store"),
+    ("X-Content-Type-Options", "nosniff"),
+]
 
 
 def page_of(shown: Controlled, title: str, host: str, token: str) -> "Starlette":
@@ -48,6 +55,7 @@ def page_of(shown: Controlled, title: str, host: str, token: str) -> "Starlette"
     user's browser was led to: 403. So it is without the token.
     """
     from starlette.applications import Starlette
+    from starlette.requests import ClientDisconnect
     from starlette.responses import HTMLResponse, PlainTextResponse, Response
     from starlette.routing import Route
 
@@ -81,14 +89,19 @@ def page_of(shown: Controlled, title: str, host: str, token: str) -> "Starlette"
         given = request.headers.get("authorization", "").removeprefix("Bearer ")
         if (answer := refused(request, given)) is not None:
             return answer
+        content = bytearray()
         try:
-            if int(request.headers.get("content-length", _LONGEST + 1)) > _LONGEST:
-                raise ValueError("the request is too long")
-            asked: Any = await request.json()
+            async for part in request.stream():
+                content += part
+                if len(content) > _LONGEST:
+                    raise ValueError("the request is too long")
+            asked: Any = json.loads(content)
             shown.turn(asked["values"])
             header, pictures = shown.view(rest=asked["rest"] is True).message()
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            return PlainTextResponse(str(error), 400)
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
+            return PlainTextResponse(str(error).encode("utf-8", "backslashreplace"), 400)
+        except (RecursionError, ClientDisconnect):
+            return PlainTextResponse("the request is nested too deeply, or ends half-way", 400)
         parts = [header.encode("utf-8"), *pictures]
         lengths = ",".join(str(len(part)) for part in parts)
         return Response(b"".join(parts), headers={"X-Lengths": lengths})
@@ -109,9 +122,28 @@ def serve(
 
     - `port`: 0 takes a free one. `announce` is given the address; `browser`: opens it.
 
+    A request of more than 10 kB is refused while it is read; one that is not whole after 10 s, and
+    at Ctrl-C, is dropped with its connection.
+
     **Errors**: OSError where the port is taken; ImportError without the extra `notebook`.
     """
     import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class Protocol(H11Protocol):
+        """HTTP that ends a connection whose request does not come whole in time."""
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self.loop.call_later(_PATIENCE, self._abort_if_incomplete)
+
+        def shutdown(self) -> None:
+            self._abort_if_incomplete()
+            super().shutdown()
+
+        def _abort_if_incomplete(self) -> None:
+            if self.cycle is None or self.cycle.more_body:
+                self.transport.abort()
 
     with socket.socket() as own:
         # A port whose last connections are not forgotten yet may be taken again.
@@ -123,5 +155,12 @@ def serve(
         announce(address)
         if browser:
             webbrowser.open(address)
-        served = uvicorn.Config(page_of(shown, title, host, token), log_level="warning")
+        served = uvicorn.Config(
+            page_of(shown, title, host, token),
+            http=Protocol,
+            ws="none",
+            log_level="error",
+            headers=_HEADERS,
+            timeout_graceful_shutdown=1,
+        )
         uvicorn.Server(served).run(sockets=[own])
