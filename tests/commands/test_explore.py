@@ -191,3 +191,6 @@ def test_what_cannot_be_explored(tmp_path):
         line = one_line(call("explore", file, "--port", port, "--no-browser"))
     assert line == f"--port {port}: Address already in use; give another, or leave it out"
     assert "is missing" in one_line(call("explore", tmp_path / "no.yaml"))
+    for port in ("-1", "70000"):
+        refused = call("explore", file, "--port", port, "--no-browser")
+        assert refused.exit_code == 2 and "Invalid value for '--port'" in refused.stderr

@@ -9,7 +9,7 @@ import typer
 
 from thincam_jax.commands.terminal import ConfigFile, Overrides, reported, say_result
 
-Port = Annotated[int, typer.Option(help="Of the page; 0 takes a free one.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one.")]
 Browser = Annotated[bool, typer.Option(help="Open the page.")]
 
 
