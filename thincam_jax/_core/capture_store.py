@@ -78,6 +78,8 @@ def opened(
     """
     zarr = zarr_library()
     try:
+        for pattern in ("*", "*/*", "digests/c/*", "matrix/c/*", "matrix/c/*/*"):
+            _refuse_links(Path(path).glob(pattern))
         for pattern in ("zarr.json", "*/zarr.json", "digests/c/*", "matrix/c/*/*"):
             for file in Path(path).glob(pattern):
                 if not file.is_file() or file.stat().st_size > _DESCRIBED:
@@ -88,6 +90,8 @@ def opened(
         if kind not in kinds or version != VERSION:
             raise ValueError(f"{kind}, version {version}")
         yield group, attributes
+    except CaptureStoreError:
+        raise
     except Exception as error:  # whatever Zarr makes of another's metadata
         raise CaptureStoreError(
             f"{path} is no {wanted[0]} ({of_error(error)}); give one that {wanted[1]} made"
@@ -204,7 +208,11 @@ class CaptureStore:
         return [*files, *(file.parent for file in files), *folders, self._chunks]
 
     def lost(self, *, truncated: bool = False) -> set[int]:
-        """The frames of chunks that are not there or not whole; or only those of the latter."""
+        """The frames of chunks that are not there or not whole; or only those of the latter.
+
+        **Errors**: CaptureStoreError for a chunk that is a link.
+        """
+        _refuse_links(self._chunks.rglob("*"))
         # A chunk at the edge is stored as large as the others; 4 bytes are the checksum.
         whole = math.prod(self.frames.chunks) * self.frames.dtype.itemsize + 4
         rows, root, found = -(-self.frames.shape[1] // self.frames.chunks[1]), self._chunks, set()
@@ -236,6 +244,15 @@ class CaptureStore:
                 f"{self.path}: frames {listed(self.damaged())} are damaged ({error}); capture "
                 "them again"
             ) from error
+
+
+def _refuse_links(files: Iterable[Path]) -> None:
+    """Refuse a store that leads out of its folder, as one made by others may."""
+    for file in files:
+        if file.is_symlink():
+            raise CaptureStoreError(
+                f"{file} is a link, which is not followed; copy the store with what it leads to"
+            )
 
 
 def frame_digest(pixels: np.ndarray) -> int:

@@ -124,11 +124,13 @@ def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, 
     assert taken.settings[0].trigger == raw["camera"].get("trigger", "Software")
 
 
-def test_a_store_is_not_written_over_and_a_missing_one_not_resumed(method_b, tmp_path):
+def test_a_store_is_not_written_over_and_a_missing_one_begun(method_b, tmp_path):
+    """As after a kill before the first frame, when the same line is typed with --resume."""
     file, store = method_b
     assert "exists; --resume goes on" in one_line(call("capture", file, "--out", store))
-    none = one_line(call("capture", file, "--out", tmp_path / "b.zarr", "--resume"))
-    assert "there is nothing to resume" in none
+    begun = call("capture", file, "--out", tmp_path / "b.zarr", "--resume")
+    assert begun.exit_code == 0, begun.output
+    assert read_acquisition(tmp_path / "b.zarr").plan == read_acquisition(store).plan
     other = call("capture", file, "--out", store, "--resume", "--set", "plan.dark_frames=1")
     assert "another plan" in one_line(other)
     assert call("capture", file, "--out", store, "--resume").exit_code == 0  # complete already

@@ -190,6 +190,24 @@ def test_a_store_that_harms_is_refused(harm, store, tmp_path, little):
     assert refused
 
 
+LINKS = ["frames", "frames/c", "frames/c/0", "frames/c/0/0", "frames/c/0/0/0", "frames/zarr.json"]
+LINKS += ["digests", "zarr.json", "plan.json", "journal.jsonl"]
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("link", LINKS)
+def test_a_store_does_not_lead_out_of_its_folder(link, reader, store, tmp_path):
+    """Each reader refuses it and writes nothing there; a copy of what it leads to is taken."""
+    path, outside = tmp_path / "a.zarr", tmp_path / "outside"
+    shutil.copytree(store, path)
+    (path / link).rename(outside)
+    (path / link).symlink_to(outside)
+    with pytest.raises(CaptureStoreError, match="is a link, which is not followed; copy"):
+        READERS[reader](path)
+    shutil.copytree(path, tmp_path / "copy.zarr")
+    READERS[reader](tmp_path / "copy.zarr")
+
+
 class Coloured:
     """Even light in three colours on a sensor whose first pixels are red and green."""
 

@@ -68,8 +68,6 @@ def capture(
         store = out or Path("runs") / f"{slug(asked.name)}.zarr"
         if store.exists() and not resume:
             raise ConfigError(f"--out {store} exists; --resume goes on with it, else give another")
-        if resume and not store.exists():
-            raise ConfigError(f"--out {store}: there is nothing to resume; leave out --resume")
         plan = build_plan(asked)
         if dry_run:
             explain.dry_run(asked, f"writes to {store}: {len(plan.steps)} frames", plan)
