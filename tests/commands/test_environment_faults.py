@@ -206,3 +206,32 @@ def test_a_faulty_environment_costs_a_line_or_nothing(words, prepare, settings, 
     printed, told = child.communicate(timeout=600)
     assert child.returncode == code and "Traceback" not in told, told
     assert told.count("\n") == (code > 0) and text in (told if code else printed)
+
+
+OPENED = """
+import sys
+from thincam_jax.commands import start
+sys.argv = ["thincam", "--version"]
+try:
+    start.main()
+except SystemExit:
+    pass
+with open("opened", "w") as file:
+    file.write(str(file.fileno()))
+"""
+
+
+def test_no_file_has_the_number_of_a_closed_stream(tmp_path):
+    """Ctrl-C and the libraries in C write to 2, whatever it is: to no journal and no image."""
+    settings = {**os.environ, "PYTHONPATH": str(ROOT)}
+    line = ["sh", "-c", '"$0" -c "$1" <&- >&- 2>&-', sys.executable, OPENED]
+    assert subprocess.run(line, cwd=tmp_path, env=settings).returncode == 0
+    assert int((tmp_path / "opened").read_text("utf-8")) > 2
+
+
+def test_with_closed_streams_the_result_is_the_same(tmp_path):
+    command = next(one for one in COMMANDS if one.name == "run")
+    arguments, closed = command.arguments(tmp_path), "import os; os.closerange(0, 3)"
+    for out, prepare in ((tmp_path / "first", ""), (tmp_path / "second", closed)):
+        ended(start(command, [*arguments, "--out", out], prepare))
+    assert command.result(tmp_path / "second") == command.result(tmp_path / "first")

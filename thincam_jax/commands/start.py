@@ -13,6 +13,9 @@ from thincam_jax.commands.interrupt import end_on_interrupt
 def main() -> None:
     """Run the command `thincam`."""
     end_on_interrupt()
+    while (unused := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass  # a stream that was closed at the start: its number is no file's to come
+    os.close(unused)
     os.environ["MPLBACKEND"] = "agg"  # figures are files
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Each line at once, so that a full disk is reported; escaped what the encoding lacks.
