@@ -2,9 +2,11 @@
 
 import dataclasses
 import errno
+import os
 import signal
 import time
 from collections import namedtuple
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +34,7 @@ from thincam_jax.hardware import (
     Region,
     Timeout,
 )
-from thincam_jax.hardware.acquisition import recorder, taker
+from thincam_jax.hardware.acquisition import journal, recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.plan import hadamard, pictures
@@ -402,3 +404,18 @@ def test_frames_of_a_store_have_one_shape(path):
     assert read_acquisition(path).sensor_shape == (4, 5)
     with pytest.raises(ValueError, match="retries = -1: give a whole number from 0"):
         Procedure(retries=-1)
+
+
+def test_a_journal_that_cannot_be_made_is_told_and_made_later(tmp_path, monkeypatch):
+    """As on a disk that has no number for another file."""
+
+    def no_inode(path, flags, *rest):
+        if flags & os.O_CREAT:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return os.open(path, flags, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal, "os", SimpleNamespace(**{**vars(os), "open": no_inode}))
+        with pytest.raises(WriteError, match="journal.jsonl: cannot be written .*; make room"):
+            run(World(), tmp_path / "a.zarr")
+    assert run(World(), tmp_path / "a.zarr").complete

@@ -1,10 +1,12 @@
 """Whatever a device does wrong, no wrong, stale or repeated frame is in the store."""
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from hardware.acquisition.fault_campaign import STOPS, campaign, require_right
 from hardware.memory_rig import World, by_rows, fiducial_plan, picture_plan, scene_plan, staying
 
 from helpers import ROOT, quick
-from thincam_jax.hardware.acquisition.acquire import acquire
+from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.errors import IncompleteFrame, ProtocolError
 from thincam_jax.hardware.virtual.faults import FAULTS
 
 PROCESS = [sys.executable, ROOT / "tests" / "hardware" / "memory_rig.py"]
@@ -37,6 +40,44 @@ def test_of_pictures_and_of_bracketed_scenes_too(fault, kind, tmp_path):
     row = campaign(fault, 6, tmp_path, kind)
     expected = (0, 6) if fault in STOPS else (6, 0)
     assert (row.injected, row.recovered, row.stopped) == (6, *expected)
+
+
+WRONG = {
+    "negative": lambda pixels: {"pixels": pixels.astype(np.int32) - 4000},
+    "half counts": lambda pixels: {"pixels": pixels + 0.5},
+    "NaN": lambda pixels: {"pixels": pixels * np.nan},
+    "too few bits": lambda pixels: {"pixels": pixels.astype(np.uint8)},
+    "no bits": lambda _: {"bit_depth": 0},
+    "bits below 0": lambda _: {"bit_depth": -1},
+    "no time": lambda _: {"time": np.nan},
+    "wide": lambda pixels: {"pixels": np.tile(pixels, (1, 2))},
+    "transposed": lambda pixels: {"pixels": pixels.T},
+    "coloured": lambda pixels: {"pixels": np.stack([pixels] * 3, -1)},
+    "another exposure": lambda _: {"exposure": 0.02},
+    "an old number": lambda _: {"number": 0},
+}
+
+
+@pytest.mark.parametrize("first", [2, 5])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_frame_that_is_none_is_not_kept(wrong, first, tmp_path):
+    """Of a driver that breaks its contract from some frame on; a sound one goes on from there."""
+    world, plan = World(), fiducial_plan(8)
+    with world.rig() as rig:
+        camera = rig.camera
+        sound, count = camera.trigger_and_grab, itertools.count(1)
+
+        def grab(timeout):
+            frame = sound(timeout)
+            return frame if next(count) < first else replace(frame, **WRONG[wrong](frame.pixels))
+
+        camera.trigger_and_grab = grab
+        with pytest.raises((ProtocolError, IncompleteFrame)) as told:
+            acquire(plan, rig, tmp_path / "store", procedure=Procedure(reopen_wait=0.0))
+        assert "\n" not in str(told.value)
+    with world.rig() as rig:
+        assert acquire(plan, rig, tmp_path / "store").complete
+    require_right(tmp_path / "store", plan)
 
 
 def frames_in(store):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from thincam_jax._core.capture_store import CaptureStoreError
-from thincam_jax._core.files import read_regular
+from thincam_jax._core.files import read_regular, writing
 from thincam_jax._core.text import of_error
 from thincam_jax.hardware.acquisition.plan import canonical_json
 
@@ -24,7 +24,8 @@ class Journal:
 
     def __init__(self, path: Path):
         self.records, whole = _parsed(path)
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        with writing(path):
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         os.ftruncate(self._file, whole)
         os.lseek(self._file, 0, os.SEEK_END)
 

@@ -251,6 +251,10 @@ class Taker:
         """Number of saturated pixels; HardwareError for a wrong frame."""
         pixels, last, bits = frame.pixels, self._last, frame.bit_depth
         name, shape = self.name("camera"), self.shape(settings)
+        held = 8 * pixels.dtype.itemsize * (pixels.dtype.name in ("uint8", "uint16"))
+        if not 0 < bits <= held or not math.isfinite(frame.time):
+            cause = f"a frame of {bits} bits as {pixels.dtype}, at {frame.time:g} s"
+            raise ProtocolError(name, "trigger", cause, "mend its driver: see Frame")
         full, highest = full_scale(frame), int(pixels.max(initial=0))
         exposed = math.isclose(frame.exposure, settings.exposure, rel_tol=0.01, abs_tol=2e-6)
         for wrong, error, cause in (
