@@ -12,7 +12,8 @@ from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.learn.plug_and_play import largest_noise
 from thincam_jax.reconstruction.normal_equations import normal_equations
-from thincam_jax.reconstruction.problem import ScaledProblem, back_projected
+from thincam_jax.reconstruction.problem import back_projected
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 
 FIELD, SENSOR = (12, 15), (14, 17)
 SIGMA = 0.05

@@ -9,7 +9,8 @@ from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.learn.residual_noise import residual_noise
 from thincam_jax.reconstruction.normal_equations import normal_equations
-from thincam_jax.reconstruction.problem import ScaledProblem, back_projected
+from thincam_jax.reconstruction.problem import back_projected
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 
 SIGMA = 0.05
 

@@ -20,8 +20,6 @@ from thincam_jax.imaging.operators import (
 from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    ScaledProblem,
-    WeightedOperator,
     gradient,
     misfit,
     objective,
@@ -31,6 +29,7 @@ from thincam_jax.reconstruction.problem import (
     total_objective,
     uniform_level,
 )
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem, WeightedOperator
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 FIELD, SENSORS = (5, 8), ((7, 6), (4, 9))

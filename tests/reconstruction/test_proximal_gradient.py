@@ -13,7 +13,7 @@ from reconstruction import extremes, scenes
 from helpers import relative_l2
 from thincam_jax.reconstruction import iterate as module
 from thincam_jax.reconstruction.iterate import Schedule, iterate
-from thincam_jax.reconstruction.problem import ScaledProblem, total_misfit, total_objective
+from thincam_jax.reconstruction.problem import total_misfit, total_objective
 from thincam_jax.reconstruction.proximal_gradient import (
     AcceleratedProximalGradient,
     FistaMethod,
@@ -21,6 +21,7 @@ from thincam_jax.reconstruction.proximal_gradient import (
     solve_fista,
 )
 from thincam_jax.reconstruction.regularisers import Sparsity, Wavelet
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.splittings import admm_method
 
 few = functools.partial(solve_fista, iterations=10)

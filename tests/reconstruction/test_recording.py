@@ -43,7 +43,7 @@ def camera_problem(captures, lenses, *, synthesis=None, noise_variance=None, val
 def psf_problem(captures, psfs, *, field_shape=None, tau=2.0, **known):
     """The problem of captures with measured PSFs."""
     imaging_model = tc.Psfs(psfs, field_shape=field_shape)
-    return tc.Recording(captures, imaging_model, **known).problem(tau=tau)
+    return tc.Recording(captures, imaging_model, background=0.0, **known).problem(tau=tau)
 
 
 def projected(image) -> jax.Array:
@@ -482,7 +482,8 @@ def test_captures_that_are_known_inside_jit_are_checked_there():
 
     @jax.jit
     def residual(psf):
-        problem = tc.Recording([capture], tc.Psfs(psf[None]), noise_variance=1.0).problem()
+        known = {"noise_variance": 1.0, "background": 0.0}
+        problem = tc.Recording([capture], tc.Psfs(psf[None]), **known).problem()
         return total_misfit(jnp.zeros(problem.image_shape), problem)
 
     psf = jnp.ones((3, 3))

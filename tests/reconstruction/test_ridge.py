@@ -129,7 +129,8 @@ def matrix_of(kernel):
 def ridge(captures, kernel, weight=1.0, noise_variance=None):
     """Through the entry point, by measured PSFs, to many digits."""
     psfs = tc.Psfs(jnp.asarray(kernel)[None], field_shape=FIELD)
-    recording = tc.Recording(jnp.asarray(captures), psfs, noise_variance=noise_variance)
+    known = {"noise_variance": noise_variance, "background": 0.0}
+    recording = tc.Recording(jnp.asarray(captures), psfs, **known)
     return tc.reconstruct(recording, tc.Ridge(weight, tolerance=1e-10, iterations=3000))
 
 

@@ -44,7 +44,6 @@ from thincam_jax.reconstruction.normal_equations import (
 from thincam_jax.reconstruction.parallel import independent_parts
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    ScaledProblem,
     back_projected,
     brightness,
     convolutions,
@@ -55,6 +54,7 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
     as_synthesis,

@@ -19,6 +19,7 @@ from thincam_jax.reconstruction.problem import (
     detector_shape,
     forward,
     or_one,
+    residuals,
 )
 from thincam_jax.reconstruction.regularisers import Image
 
@@ -96,9 +97,9 @@ def _residual_power(problem: InverseProblem, image: Image) -> Array:
     those of two distances, have next to none of their noise at high frequencies.
     """
     powers = []
-    parts = zip(problem.operators, problem.captures, problem.weights, strict=True)
-    for o, capture, w in parts:
-        left = jnp.sqrt(w) * (forward(o, image) - capture)
+    parts = zip(problem.operators, residuals(problem, image), problem.weights, strict=True)
+    for o, residual, w in parts:
+        left = jnp.sqrt(w) * residual
         if _has_parts(o):
             for axis in range(-len(detector_shape(o)), 0):
                 left = jnp.moveaxis(left, axis, 0)

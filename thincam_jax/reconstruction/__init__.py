@@ -24,11 +24,11 @@ from thincam_jax.reconstruction.problem import total_objective as total_objectiv
 from thincam_jax.reconstruction.proximal_gradient import solve_fista as solve_fista
 from thincam_jax.reconstruction.psf_check import PsfCheck as PsfCheck
 from thincam_jax.reconstruction.psf_check import check_psf as check_psf
-from thincam_jax.reconstruction.recording import Reconstruction as Reconstruction
 from thincam_jax.reconstruction.recording import Recording as Recording
 from thincam_jax.reconstruction.regularisers import Cosines as Cosines
 from thincam_jax.reconstruction.regularisers import Sparsity as Sparsity
 from thincam_jax.reconstruction.regularisers import Wavelet as Wavelet
+from thincam_jax.reconstruction.result import Reconstruction as Reconstruction
 from thincam_jax.reconstruction.ridge import Ridge as Ridge
 from thincam_jax.reconstruction.ridge import solve_ridge as solve_ridge
 from thincam_jax.reconstruction.solver import AbstractSolver as AbstractSolver

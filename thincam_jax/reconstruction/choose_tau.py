@@ -194,7 +194,7 @@ def _risk(problem: InverseProblem, image, moved, probes):
     for operator, weight, probe, residual in zip(
         problem.operators, _full(problem), probes, residuals(problem, image), strict=True
     ):
-        response = forward(operator, moved - image)
+        response = forward(operator, moved - image)  # that of the background is less than a pixel's
         size = 0.01  # of the probe's square in units of the variance
         divergence = jnp.sum(weight * probe * response) / size
         known = jnp.sum((weight > 0).astype(weight.dtype))

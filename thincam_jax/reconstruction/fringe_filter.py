@@ -16,7 +16,8 @@ from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.imaging_model import Cameras
-from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.reconstruction.wiener import require_cameras, require_captures
 
@@ -118,7 +119,7 @@ class FringeScanning(AbstractSolver):
         return FringeFilter(cameras)
 
     def solve(self, recording: Recording):
-        return self.prepare(require_cameras(recording, self.name))(jnp.stack(recording.captures))
+        return self.prepare(require_cameras(recording, self.name))(jnp.stack(recording.light))
 
 
 @jax.jit

@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.admm import RELAXATION, AbstractSplitting, Admm, admm_map
-from thincam_jax.reconstruction.problem import InverseProblem, ScaledProblem, total_misfit
+from thincam_jax.reconstruction.problem import InverseProblem, total_misfit
 from thincam_jax.reconstruction.regularisers import Image, prox, zero_dual
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.splittings import splitting_of
 
 

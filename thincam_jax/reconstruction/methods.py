@@ -33,8 +33,9 @@ from thincam_jax.reconstruction.problem import (
     uniform_level,
 )
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
-from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.ridge import Ridge
 from thincam_jax.reconstruction.solver import (
     DEFAULT_TAU,

@@ -44,6 +44,7 @@ from thincam_jax.reconstruction.problem import (
     convolutions,
     detector_shape,
     forward,
+    or_one,
 )
 
 # Of conjugate gradients within an iteration, relative to the right-hand side.
@@ -110,7 +111,8 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
         assert modes is not None
         values = jnp.abs(_gain(fixed.operators[0])) * modes.values
         weighted = replace(modes, values=jnp.sqrt(jnp.mean(fixed.weights[0])) * values)
-        if bare[0].terms == 1 and fixed.weights[0].size == 1:
+        closed = bare[0].terms == 1 and not fixed.free_background
+        if closed and fixed.weights[0].size == 1:
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
     convolved = convolutions(fixed)
@@ -325,18 +327,23 @@ def _gain(operator: AbstractOperator):
 
 @jax.jit
 def _gram(problem: InverseProblem) -> Float[Array, "n n"]:
-    """Σ AᵀwA."""
+    """Σ AᵀwA; with free backgrounds, of columns of A less their means by the weights."""
     parts = []
     for operator, weight in _weighted(problem):
         bare, gain = _bare(operator), _gain(operator)
         assert isinstance(bare, Matrix)
         matrix = bare.matrix
         if weight.size == 1:
-            parts.append(weight.reshape(()) * gain**2 * product(matrix.T, matrix))
+            even = weight.reshape(()) * gain**2
+            parts.append(even * product(matrix.T, matrix))
+            total, pulled = even * matrix.shape[0], even * jnp.sum(matrix, axis=0)
         else:
             rows = weight.reshape(weight.shape[-len(detector_shape(operator)) :])
             rows = jnp.broadcast_to(rows, detector_shape(operator)).reshape(-1, 1)
             parts.append(gain**2 * product(matrix.T, rows * matrix))
+            total, pulled = gain**2 * jnp.sum(rows), gain**2 * jnp.sum(rows * matrix, axis=0)
+        if problem.free_background:
+            parts.append(-jnp.outer(pulled, pulled) / or_one(total))
     return sum(parts[1:], start=parts[0])
 
 

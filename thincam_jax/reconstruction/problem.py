@@ -1,6 +1,5 @@
 """The inverse problem of a reconstruction, for any camera with a linear operator."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.precision import product, squared_modulus
+from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
 from thincam_jax.imaging.operators.base import is_shape
 from thincam_jax.imaging.operators.separable import Separable
@@ -48,6 +47,9 @@ class InverseProblem(eqx.Module):
     - `tau`: τ ≥ 0, relative.
     - `regulariser`: R; default isotropic total variation.
     - `nonnegative`: whether to constrain f ≥ 0.
+    - `free_background`: whether each capture and channel has a uniform background b_k that is not
+      known. The least squares are then those of A_k f + b_k − g_k with the best b_k, the mean of
+      the residual by weights w_k, for every f.
 
     **Errors**: ValueError, one line, where operators and captures do not fit.
 
@@ -71,6 +73,7 @@ class InverseProblem(eqx.Module):
     tau_unit: Float[Array, ""]
     regulariser: AbstractRegulariser
     nonnegative: bool = eqx.field(static=True)
+    free_background: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -81,6 +84,7 @@ class InverseProblem(eqx.Module):
         tau: Number = 2.0,
         regulariser: AbstractRegulariser | None = None,
         nonnegative: bool = True,
+        free_background: bool = False,
     ):
         operators = [operators] if isinstance(operators, AbstractOperator) else list(operators)
         captures = list(captures) if isinstance(captures, tuple | list) else [captures]
@@ -109,7 +113,7 @@ class InverseProblem(eqx.Module):
         self.tau = checks.non_negative("tau", tau, "a ratio").astype(dtype)
         self.tau_unit = backprojected_noise(self.operators, self.weights).astype(dtype)
         self.regulariser = TotalVariation() if regulariser is None else regulariser
-        self.nonnegative = nonnegative
+        self.nonnegative, self.free_background = nonnegative, free_background
 
     @property
     def absolute_tau(self) -> Float[Array, ""]:
@@ -165,18 +169,40 @@ def back_project(operator: AbstractOperator, capture: Float[Array, "..."]) -> Fl
 
 
 def residuals(problem: InverseProblem, image: Image):
-    """A_k f − g_k of every capture."""
-    return tuple(
+    """A_k f + b_k − g_k of every capture; b_k = 0 without a free background."""
+    differences = [
         forward(operator, image) - capture
         for operator, capture in zip(problem.operators, problem.captures, strict=True)
-    )
+    ]
+    return without_background(problem, differences)
+
+
+def without_background(
+    problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
+) -> tuple[Float[Array, "..."], ...]:
+    """Captures less their means by the weights, where the background is free."""
+    if not problem.free_background:
+        return tuple(differences)
+    parts = zip(problem.operators, problem.weights, differences, strict=True)
+    return tuple(d - weighted_mean(w, d, len(detector_shape(o))) for o, w, d in parts)
+
+
+def weighted_mean(
+    weight: Float[Array, "..."], capture: Float[Array, "..."], axes: int
+) -> Float[Array, "..."]:
+    """Mean over the last axes, which keep the length 1; 0 where all weights are."""
+    last = tuple(range(-axes, 0))
+    whole = jnp.broadcast_to(weight, capture.shape)
+    total = jnp.sum(whole, axis=last, keepdims=True)
+    return jnp.sum(whole * capture, axis=last, keepdims=True) / or_one(total)
 
 
 def back_projected(
     problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
 ) -> Float[Array, "..."]:
-    r""":math:`\sum_k A_k^T w_k d_k`."""
-    parts = zip(problem.operators, problem.weights, differences, strict=True)
+    r""":math:`\sum_k A_k^T w_k d_k`, of captures without their free background."""
+    known = without_background(problem, differences)
+    parts = zip(problem.operators, problem.weights, known, strict=True)
     first, *others = [back_project(operator, w * d) for operator, w, d in parts]
     return sum(others, start=first)
 
@@ -232,20 +258,40 @@ def with_tau(problem: InverseProblem, tau: Number) -> InverseProblem:
     return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau, problem.tau.dtype))
 
 
+# Part of the squares of a uniform image's capture that must not be uniform to show its brightness.
+_UNEVEN = 1e-3
+
+
 def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
-    """The brightness of a uniform image that explains each channel best, by least squares."""
+    r"""The brightness of a uniform image that explains each channel best, by least squares.
+
+    Where a free background would explain it as well, the brightness is that of an image of full
+    contrast: between :math:`\sigma_g/\sum h`, where its detail is coarser than the PSF h, and
+    :math:`\sigma_g/(\sum h^2)^{1/2}`, where its pixels vary independently, the geometric mean.
+    """
     seen, light = 0.0, 0.0
     for operator, capture, weight in zip(
         problem.operators, problem.captures, problem.weights, strict=True
     ):
         axes = tuple(range(-len(detector_shape(operator)), 0))
         flat = forward(operator, jnp.ones((1,) * 4, capture.dtype))
-        if isinstance(operator, Separable) and weight.size == 1:  # by products, which are faster
+        if problem.free_background:
+            whole, uneven = flat, flat - weighted_mean(weight, flat, len(axes))
+            even = weighted_mean(weight, flat**2, len(axes))
+            shown = weighted_mean(weight, uneven**2, len(axes)) > _UNEVEN * even
+            capture = capture - weighted_mean(weight, capture, len(axes))
+            spread = jnp.sqrt(weighted_mean(weight, capture**2, len(axes)))
+            gain = jnp.sqrt(or_one(jnp.sqrt(even * operator.mean_power())))
+            flat = jnp.where(shown, uneven, whole)
+            capture = jnp.where(shown, capture, spread / gain * whole)
+        if (
+            isinstance(operator, Separable) and weight.size == 1 and not problem.free_background
+        ):  # by products, which are faster
             rows, columns = operator.left.sum(axis=2), operator.right.sum(axis=2)
-            added = weight.reshape(()) * jnp.sum(product(rows, capture) * columns, axis=axes)
-        else:
-            added = jnp.sum(weight * flat * capture, axis=axes)
-        seen = seen + added
+            seen = seen + weight.reshape(()) * jnp.sum(product(rows, capture) * columns, axis=axes)
+            light = light + jnp.sum(weight * flat * flat, axis=axes)
+            continue
+        seen = seen + jnp.sum(weight * flat * capture, axis=axes)
         light = light + jnp.sum(weight * flat * flat, axis=axes)
     light = jnp.broadcast_to(light, jnp.shape(seen))
     return jnp.where(light > 0, seen / jnp.where(light > 0, light, 1), 0)
@@ -354,72 +400,6 @@ def _check_operators(operators, captures) -> None:
         )
 
 
-# The power method approaches the largest singular value from below.
-MARGIN = 1.05
-
-POWER_ITERATIONS = 40
-
-
-class WeightedOperator(AbstractOperator):
-    r"""Weighted operators of a problem and its batch, :math:`f \mapsto (\sqrt{w_k}\, A_k f)_k`."""
-
-    problem: InverseProblem
-
-    @property
-    def in_shape(self) -> tuple[int, ...]:
-        return self.problem.image_shape
-
-    @property
-    def out_shape(self) -> tuple[tuple[int, ...], ...]:
-        return tuple(c.shape for c in self.problem.captures)
-
-    def __call__(self, image: Image):
-        pairs = zip(self.problem.operators, self.problem.weights, strict=True)
-        return tuple(jnp.sqrt(w) * forward(operator, image) for operator, w in pairs)
-
-    def adjoint(self, capture: tuple[Float[Array, "..."], ...]):
-        parts = zip(self.problem.operators, self.problem.weights, capture, strict=True)
-        first, *others = [back_project(operator, jnp.sqrt(w) * c) for operator, w, c in parts]
-        return sum(others, start=first)
-
-
-class ScaledProblem(eqx.Module):
-    r"""A problem rescaled so that the gradient of its misfit has Lipschitz constant 1.
-
-    Captures are about 1, weights at most 1, and :math:`\|\sqrt{w}A\| \le 1`. τ is scaled for a
-    regulariser with R(sf) = sR(f), such as a norm. Iterations compute the same numbers in all units
-    of captures, pixels and weights.
-
-    - `image_unit`: times this, an image of `problem` is one of the problem given; `capture_unit`:
-      the same for captures.
-    - `curvature`: Lipschitz constant of the problem given, with a margin.
-
-    Fewer `iterations` of the power method are faster, and ‖√w A‖ may then be somewhat above 1.
-    """
-
-    problem: InverseProblem
-    image_unit: Float[Array, ""]
-    capture_unit: Float[Array, ""]
-    curvature: Float[Array, ""]
-
-    def __init__(self, problem: InverseProblem, iterations: int = POWER_ITERATIONS):
-        # The minimiser does not depend on these units, nor do its derivatives on theirs.
-        operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem), iterations)
-        self.problem = _divided(problem, operator_unit, captured, heaviest)
-        self.image_unit, self.capture_unit = captured / operator_unit, captured
-        self.curvature = heaviest * operator_unit**2
-
-
-@functools.partial(jax.jit, static_argnames="iterations")
-def _units(problem: InverseProblem, iterations: int):
-    """Units of operators, captures and weights."""
-    heaviest = or_one(jnp.stack([jnp.max(w) for w in problem.weights]).max())
-    strongest = or_one(jnp.stack([_strength(o) for o in problem.operators]).max())
-    captured = _root_mean_square(problem.captures)
-    norm = _norm(_divided(problem, strongest, captured, heaviest), iterations)
-    return strongest * norm, captured, heaviest
-
-
 def or_one(value: Float[Array, "..."]) -> Float[Array, "..."]:
     """The value where it is positive, else 1: a safe divisor."""
     return jnp.where(value > 0, value, 1)
@@ -430,57 +410,3 @@ def brightness(image: Float[Array, "..."]) -> Float[Array, ""]:
     """Mean of f weighted by f², Σ f³/Σ f² over f > 0, in which dark surroundings do not count."""
     bright = jnp.maximum(image, 0)
     return jnp.sum(bright**3) / or_one(jnp.sum(bright**2))
-
-
-def _strength(operator: AbstractOperator) -> Float[Array, ""]:
-    """A rough estimate of ‖A‖, which keeps squares within the range of the precision."""
-    if isinstance(operator, CropConvolution):
-        return jnp.max(jnp.abs(operator.spectrum))
-    return operator.norm(iterations=3)
-
-
-def _divided(problem: InverseProblem, operator_unit, capture_unit, weight_unit) -> InverseProblem:
-    operators = tuple(_times(o, 1 / operator_unit) for o in problem.operators)
-    captures = tuple(c / capture_unit for c in problem.captures)
-    weights = tuple(w / weight_unit for w in problem.weights)
-    tau_unit = problem.tau_unit / weight_unit / operator_unit / capture_unit
-    return eqx.tree_at(
-        lambda p: (p.operators, p.captures, p.weights, p.tau_unit),
-        problem,
-        (operators, captures, weights, tau_unit),
-    )
-
-
-def _times(operator: AbstractOperator, factor) -> AbstractOperator:
-    """An operator times a number, without a copy of a dense matrix."""
-    if isinstance(operator, CropConvolution):
-        spectrum = operator.spectrum * factor.astype(operator.spectrum.dtype)
-        return eqx.tree_at(lambda o: o.spectrum, operator, spectrum)
-    return Scaled(operator, factor)
-
-
-def _norm(problem: InverseProblem, iterations: int) -> Float[Array, ""]:
-    """‖√w A‖ with a margin, by the power method, at most the bound of the spectra."""
-    dtype = problem.captures[0].dtype
-    (first, *others), (weight, *_) = problem.operators, problem.weights
-    if not others and weight.size == 1:  # the operator may know its own norm
-        found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=iterations, dtype=dtype)
-    else:
-        found = WeightedOperator(problem).norm(iterations=iterations, dtype=dtype)
-    found = MARGIN * found
-    operators = convolutions(problem)
-    if operators is None:
-        return or_one(found)
-    # Placing on the window and cropping have norm 1: the transfer functions bound the norm.
-    power = sum(
-        jnp.max(w) * jnp.sum(squared_modulus(o.spectrum), axis=-3)
-        for o, w in zip(operators, problem.weights, strict=True)
-    )
-    return or_one(jnp.minimum(found, jnp.sqrt(jnp.max(power))))
-
-
-def _root_mean_square(arrays) -> Float[Array, ""]:
-    """Root mean square of all arrays, without overflow or underflow of squares."""
-    largest = or_one(jnp.stack([jnp.max(jnp.abs(a)) for a in arrays]).max())
-    means = [jnp.mean((a / largest) ** 2) for a in arrays]
-    return or_one(largest * jnp.sqrt(sum(means) / len(means)))

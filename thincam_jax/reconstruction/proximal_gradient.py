@@ -25,7 +25,6 @@ from thincam_jax.reconstruction.iterate import (
 )
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    ScaledProblem,
     compiled_objective,
     start_image,
     total_misfit,
@@ -39,6 +38,7 @@ from thincam_jax.reconstruction.regularisers import (
     prox,
     zero_dual,
 )
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 
 
 class AbstractProximalMap(eqx.Module):

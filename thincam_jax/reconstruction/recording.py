@@ -1,4 +1,4 @@
-"""Recordings (captures with their imaging model and noise) and reconstructed images."""
+"""Recordings: captures with their imaging model and noise."""
 
 import dataclasses
 import math
@@ -16,7 +16,6 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import unchecked
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -30,11 +29,12 @@ from thincam_jax.imaging.operators.base import is_shape, shapes_of
 from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
-from thincam_jax.reconstruction.iterate import Outcome, Progress
+from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.planes import warn_of_equal_planes
 from thincam_jax.reconstruction.problem import InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.synthesis import (
     Channel,
     channel_capture,
@@ -42,55 +42,6 @@ from thincam_jax.reconstruction.synthesis import (
     synthesis_matrix,
     with_channel,
 )
-
-
-class Reconstruction(Module):
-    """A reconstructed image; with cameras upright as the scene is, otherwise as the captures are.
-
-    - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
-    - `pitch`: distance of its pixels on the object, mm (of each plane); None without cameras.
-    - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`, or what
-      was noticed when τ was left to a rule.
-    - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
-      callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
-    - `history`: objective and residuals along the way; see `Progress`.
-    - `iterations`, `seconds`: done and taken; compilation is part of the time.
-    - `tau`: the relative τ used, as given or found; None for methods without.
-    - `consistency`, `confidence`: of a learned method, which may make things up: residual of the
-      explained capture, root mean square, over the noise's deviation, for each element of the
-      batch; and how sure it is of each pixel, 0 to 1, (*batch, y, x).
-    """
-
-    image: Float[Array, "*batch y x"]
-    pitch: Float[Array, "*plane"] | None = eqx.field(converter=unchecked("mm"))
-    method: str = eqx.field(static=True, default="")
-    reason: str = eqx.field(static=True, default="")
-    ending: str | None = eqx.field(static=True, default=None)
-    history: tuple[Progress, ...] = eqx.field(static=True, default=(), repr=False)
-    iterations: int = eqx.field(static=True, default=0)
-    seconds: float = eqx.field(static=True, default=0.0)
-    tau: float | None = eqx.field(static=True, default=None)
-    consistency: Float[Array, "*capture"] | None = None
-    confidence: Float[Array, "*capture y x"] | None = None
-
-    @property
-    def status(self) -> str:
-        """`ending`, or "ok" without one; "non_finite" for NaN or infinity. Unknown inside jit."""
-        if not bool(jnp.isfinite(self.image).all()):
-            return "non_finite"
-        return self.ending or "ok"
-
-    @property
-    def has_planes(self) -> bool:
-        """Whether the images of several distances are known to be behind each other."""
-        return self.pitch is not None and self.pitch.ndim > 0
-
-    def _repr_png_(self) -> bytes:
-        """Figure for notebooks: axes in mm, gamma 2.2; planes and a batch side by side."""
-        from thincam_jax.plot.frame import as_png
-        from thincam_jax.plot.images import draw_result
-
-        return as_png(draw_result(self))
 
 
 class Recording(Module):
@@ -106,6 +57,11 @@ class Recording(Module):
     - `noise_variance`: one number, or one for each capture, in the captures' units squared. By
       default it is estimated by `estimate_variance`, which needs captures that are images.
     - `valid`: mask of the valid pixels, that broadcasts to the captures.
+    - `background`: known light that is not the scene's, such as a black level or a dark frame: one
+      for all captures, or one for each, that broadcasts to them. By default it is unknown behind
+      `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
+      (but by `Wiener`, `FringeScanning` and `PoissonTV`), at no cost where there is none. 0 with
+      operators.
 
     **Errors**: ValueError, one line, for captures that do not fit the imaging model.
 
@@ -125,9 +81,16 @@ class Recording(Module):
     imaging_model: Cameras | Psfs | Stacked
     noise_variance: Any
     valid: tuple[Array, ...] | None
+    background: Any
 
     def __init__(
-        self, captures: Any, imaging_model: Any, *, noise_variance: Any = None, valid: Any = None
+        self,
+        captures: Any,
+        imaging_model: Any,
+        *,
+        noise_variance: Any = None,
+        valid: Any = None,
+        background: Any = None,
     ):
         if isinstance(imaging_model, AbstractOperator):
             if is_shape(imaging_model.out_shape):
@@ -158,6 +121,7 @@ class Recording(Module):
         self.captures = tuple(as_real(c) for c in captures)
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
+        self.background = None if background is None else self._backgrounds(background)
         if noise_variance is not None:
             given_variances(noise_variance, self.captures)  # refuses others
         self.valid = None if valid is None else self._masks(valid)
@@ -181,7 +145,12 @@ class Recording(Module):
           converge much faster.
         """
         captures, valid = self._masked_captures()
-        settings = {"tau": tau, "regulariser": regulariser, "nonnegative": nonnegative}
+        settings = {
+            "tau": tau,
+            "regulariser": regulariser,
+            "nonnegative": nonnegative,
+            "free_background": self._background_is_free(),
+        }
         operators = self._operators()
         if operators:
             _no_synthesis(synthesis, "operators")
@@ -303,6 +272,36 @@ class Recording(Module):
             return model.field_operators(self._field()) if model.over_field else ()
         return model.operators if isinstance(model, Stacked) else ()
 
+    def _backgrounds(self, background: Any) -> tuple[Array, ...]:
+        """A known background for each capture."""
+        several = isinstance(background, tuple | list) or np.ndim(background) > len(
+            self.captures[0].shape
+        )
+        each = [checks.array("background", b) for b in (background if several else [background])]
+        each = each * len(self.captures) if len(each) == 1 else each
+        shapes = [c.shape for c in self.captures]
+        if len(each) != len(shapes) or any(
+            n not in (1, m)
+            for b, s in zip(each, shapes, strict=True)
+            for n, m in zip(b.shape[::-1], (*s[::-1], *(0,) * b.ndim), strict=False)
+        ):
+            raise ValueError(
+                f"background has shapes {[b.shape for b in each]}; give a number or a frame, for "
+                f"all captures or one for each, of shapes {shapes}"
+            )
+        return tuple(each)
+
+    def _background_is_free(self) -> bool:
+        return self.background is None and not isinstance(self.imaging_model, Stacked)
+
+    @property
+    def light(self) -> tuple[Float[Array, "..."], ...]:
+        """The captures less their background, where it is known."""
+        if self.background is None:
+            return self.captures
+        pairs = zip(self.captures, self.background, strict=True)
+        return tuple(c - b.astype(c.dtype) for c, b in pairs)
+
     def _masks(self, valid: Any) -> tuple[Array, ...]:
         """A mask for each capture."""
         shapes = [c.shape for c in self.captures]
@@ -323,8 +322,8 @@ class Recording(Module):
     def _masked_captures(self) -> tuple[list[Array], list[Array | None]]:
         """Captures and masks; pixels that are neither valid nor finite become 0."""
         if self.valid is None:
-            return list(self.captures), [None] * len(self.captures)
-        pairs = list(zip(self.captures, self.valid, strict=True))
+            return list(self.light), [None] * len(self.captures)
+        pairs = list(zip(self.light, self.valid, strict=True))
         return [_without_invalid(c, m) for c, m in pairs], [m for _, m in pairs]
 
     def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:

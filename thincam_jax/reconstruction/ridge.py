@@ -60,7 +60,6 @@ from thincam_jax.reconstruction.normal_equations import (
 )
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    ScaledProblem,
     back_projected,
     or_one,
     residuals,
@@ -69,6 +68,7 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis, as_tolerance
 
 Rule = Literal["gcv", "sure", "likelihood"]

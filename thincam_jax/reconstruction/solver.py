@@ -16,8 +16,9 @@ from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators.crop_convolution import place
 from thincam_jax.reconstruction.iterate import Callback
 from thincam_jax.reconstruction.problem import InverseProblem, compiled_level
-from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 # A real matrix (channel × capture): sums of captures, reconstructed in place of the captures.

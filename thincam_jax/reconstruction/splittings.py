@@ -45,12 +45,13 @@ from thincam_jax.reconstruction.admm import (
 from thincam_jax.reconstruction.normal_equations import AbstractNormal, normal_equations
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    ScaledProblem,
     back_projected,
     convolutions,
     or_one,
+    weighted_mean,
 )
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.total_variation import (
     TotalVariation,
     differences,
@@ -90,6 +91,7 @@ class FourierSplitting(AbstractSplitting):
     captures: tuple[Float[Array, "*batch channel y x"], ...]
     weights: tuple[Float[Array, "..."], ...]
     normal: "NormalInverse"
+    free_background: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -102,6 +104,7 @@ class FourierSplitting(AbstractSplitting):
         self.operators = operators
         self.gains, self.captures, self.weights, self.tau, self.normal, self.image_unit = units
         self.variation, self.nonnegative = variation, problem.nonnegative
+        self.free_background = problem.free_background
         self.penalties = _default_penalties(self.operators, self.gains)
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
@@ -123,7 +126,7 @@ class FourierSplitting(AbstractSplitting):
         operator, window = self.operators[0], self.operators[0].window
         masks = field_masks(operator.field_shape, window, operator.field_corner)
         data = [
-            q + 2 * _data_pull(o, capture, weight, self.penalties.data, q)
+            q + 2 * self._data_pull(o, capture, weight, q)
             for q, o, capture, weight in zip(
                 state.data, self.operators, self.captures, self.weights, strict=True
             )
@@ -145,6 +148,17 @@ class FourierSplitting(AbstractSplitting):
             factor = (penalties.data * gain).astype(total.dtype)
             total = total + factor * operator.spread(jnp.fft.rfft2(data))
         return self._images(self.normal(total, penalties))
+
+    def _data_pull(self, operator: CropConvolution, capture, weight, q):
+        """z − q of a capture: zero outside of the sensor; z is best with its background, if free.
+
+        The minimum over z has the weights of `share` for the background.
+        """
+        seen = cut(q, operator.sensor_corner, operator.sensor_shape)
+        share, missing = weight / (weight + self.penalties.data), capture - seen
+        if self.free_background:
+            missing = missing - weighted_mean(share, missing, 2)
+        return place(share * missing, operator.sensor_corner, operator.window)
 
     def _images(self, spectrum) -> State:
         """K f of an image's spectrum."""
@@ -172,13 +186,6 @@ def _units(problem: InverseProblem, operators, variation: TotalVariation):
     tau = problem.absolute_tau / (operator_unit * capture_unit)
     normal = NormalInverse(operators, gains, variation.depth_weight)
     return gains, captures, weights, tau, normal, capture_unit / operator_unit
-
-
-def _data_pull(operator: CropConvolution, capture, weight, penalty, q):
-    """z − q of a capture: zero outside of the sensor."""
-    seen = cut(q, operator.sensor_corner, operator.sensor_shape)
-    pull = weight / (weight + penalty) * (capture - seen)
-    return place(pull, operator.sensor_corner, operator.window)
 
 
 @jax.jit

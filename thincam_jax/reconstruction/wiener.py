@@ -31,7 +31,8 @@ from thincam_jax.reconstruction.imaging_model import (
     registered_shape,
 )
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
-from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis
 from thincam_jax.reconstruction.synthesis import keep_bias, phase_contrasts, synthesis_matrix
 
@@ -235,7 +236,7 @@ class Wiener(AbstractSolver):
 
     def solve(self, recording: Recording):
         cameras = require_cameras(recording, self.name)
-        captures = jnp.stack(recording.captures)
+        captures = jnp.stack(recording.light)
         variance = recording.noise_variance
         if variance is None:
             variance = estimate_variance(captures)
@@ -391,7 +392,7 @@ def filter_suffices(recording: Recording, synthesis: Synthesis | None) -> tuple[
     if np.ndim(model.object_distance) > 0:
         return False, "several planes are requested, which a filter does not separate"
     cameras, noise_variance = model.cameras, recording.noise_variance
-    captures = jnp.stack(recording.captures)
+    captures = jnp.stack(recording.light)
     matrix = synthesis_matrix(synthesis, cameras, distance_ratios(cameras))
     biased = keep_bias(matrix)
     biased |= np.array([_backgrounds_differ(row, cameras) for row in matrix])

@@ -184,7 +184,7 @@ def _solver(
     def solved(captures: Array, variances: Array) -> Reconstruction:
         """On the crop model; without noise in the study it is estimated."""
         noise_variance = None if study.noise is None else variances
-        recording = Recording(captures, cameras, noise_variance=noise_variance)
+        recording = Recording(captures, cameras, noise_variance=noise_variance, background=0.0)
         return reconstruct(recording, coupled(solver, captures.shape[1]))
 
     return solved

@@ -7,7 +7,7 @@ import pytest
 
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution, adjoint_error, low_rank_psf
-from thincam_jax.reconstruction.problem import MARGIN
+from thincam_jax.reconstruction.scaled_problem import MARGIN
 
 SENSOR, FIELD, KERNEL, PITCH = (21, 26), (17, 22), (11, 13), 0.5
 

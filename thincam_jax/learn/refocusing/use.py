@@ -17,7 +17,8 @@ from thincam_jax.learn.refocusing.network import RefocusNetwork, explain, flatte
 from thincam_jax.learn.refocusing.store import SHIPPED, described, load, same_camera
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
-from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
 
 # Residual over noise from which an image is doubted.

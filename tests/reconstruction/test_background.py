@@ -1,0 +1,149 @@
+"""A uniform background that nobody knows: eliminated in every solver's data term."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import thincam_jax as tc
+from helpers import finite_difference
+from thincam_jax.imaging.operators import Matrix
+from thincam_jax.reconstruction.normal_equations import normal_equations
+from thincam_jax.reconstruction.problem import InverseProblem, gradient, objective, total_misfit
+from thincam_jax.reconstruction.ridge import solve_ridge
+
+RNG = np.random.default_rng(65)
+SHAPE = (11, 14)  # of the sensor
+VALID = RNG.random((2, *SHAPE)) > 0.1
+
+
+def scene():
+    """A disc and a bar, dark around them, on the field of PSFs of 5×6."""
+    y, x = np.indices((15, 19)) - np.array([[[7]], [[8]]])
+    return 1.0 * (np.hypot(y, x) < 4) + 0.7 * ((abs(y - 3) < 2) & (abs(x) < 7))
+
+
+def recording(offsets=(0.0, 0.0), noise=1e-3, **known):
+    """Two captures of the scene with backgrounds, some of their pixels dead."""
+    psfs = tc.Psfs(np.random.default_rng(1).random((2, 5, 6)) ** 3)
+    blank = tc.Recording(np.zeros((2, *SHAPE)), psfs, noise_variance=noise**2, background=0.0)
+    image = jnp.asarray(scene())[None, None]
+    seen = [np.asarray(operator(image))[0] for operator in blank.problem().operators]
+    drawn = noise * np.random.default_rng(2).standard_normal((2, *SHAPE))
+    seen = np.stack(seen) + drawn + np.reshape(offsets, (2, 1, 1))
+    return tc.Recording(
+        np.where(VALID, seen, 1e6), psfs, noise_variance=noise**2, valid=VALID, **known
+    )
+
+
+def dense(problem):
+    """(A, w, g) of all captures by columns."""
+    units = jnp.eye(np.prod(problem.image_shape)).reshape(-1, *problem.image_shape)
+    rows = [jax.vmap(o)(units).reshape(len(units), -1).T for o in problem.operators]
+    weights = [jnp.broadcast_to(w, c.shape).ravel() for w, c in _parts(problem)]
+    captures = [c.ravel() for c in problem.captures]
+    return [np.asarray(jnp.concatenate(parts)) for parts in (rows, weights, captures)]
+
+
+def _parts(problem):
+    return zip(problem.weights, problem.captures, strict=True)
+
+
+def test_the_misfit_is_the_least_over_all_backgrounds():
+    """By scipy: the image and a number for each capture, by weights, dead pixels left out."""
+    problem = recording((3.0, -1.0)).problem()
+    matrix, weights, captures = dense(problem)
+    image = np.random.default_rng(3).random(problem.image_shape)
+    missing = matrix @ image.ravel() - captures
+    levels = np.kron(np.eye(2), np.ones((np.prod(SHAPE), 1)))
+    root = np.sqrt(weights)
+    best = scipy.optimize.lsq_linear(root[:, None] * levels, -root * missing)
+    np.testing.assert_allclose(total_misfit(jnp.asarray(image), problem), best.cost, rtol=1e-9)
+    expected = matrix.T @ (weights * (missing + levels @ best.x))
+    np.testing.assert_allclose(np.ravel(gradient(problem, jnp.asarray(image))), expected, atol=1e-3)
+
+
+def test_ridge_solves_for_image_and_backgrounds():
+    problem = recording((3.0, -1.0)).problem()
+    matrix, weights, captures = dense(problem)
+    levels = np.kron(np.eye(2), np.ones((np.prod(SHAPE), 1)))
+    both = np.concatenate([matrix, levels], axis=1)
+    prior = np.diag([30.0] * matrix.shape[1] + [0.0, 0.0])
+    normal = both.T @ (weights[:, None] * both) + prior
+    exact = np.linalg.solve(normal, both.T @ (weights * captures))
+    zero = jnp.zeros((1, 1, 1, 1))
+    found = solve_ridge(problem, precision=30.0, mean=zero, iterations=5000, tolerance=1e-12)
+    np.testing.assert_allclose(np.ravel(found.image), exact[:-2], atol=1e-6)
+
+
+def test_dense_normal_equations_know_it():
+    """The Gram matrix of a `Matrix`, one weight or many, against its application."""
+    matrix = RNG.random((20, 12))
+    for weight in (2.0, RNG.random((4, 5))):
+        operator = Matrix(matrix, (3, 4), (4, 5))
+        capture = RNG.random((1, 4, 5))
+        problem = InverseProblem(operator, [capture], weights=[weight], free_background=True)
+        normal = normal_equations(problem, jnp.asarray(0.3))
+        right = jnp.asarray(RNG.random(problem.image_shape))
+        np.testing.assert_allclose(normal.applied(normal.solve(right)), right, atol=1e-10)
+
+
+SOLVERS = [
+    tc.AdmmTV(2.0, iterations=60),
+    tc.Fista(2.0, iterations=60),
+    tc.Ridge(0.5, tolerance=1e-8, iterations=3000),
+    tc.PlugAndPlay(),
+]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: solver.name)
+def test_no_solver_sees_a_uniform_background(solver):
+    """Another one for each capture, several times the light: the same image; 0, if 0 is known."""
+    plain = tc.reconstruct(recording(), solver).image
+    other = tc.reconstruct(recording((3.0, -1.0)), solver).image
+    size = float(jnp.abs(plain).max())
+    np.testing.assert_allclose(other, plain, atol=2e-3 * size)
+    wrong = tc.reconstruct(recording((3.0, -1.0), background=0.0), solver).image
+    assert float(jnp.abs(wrong - plain).max()) > 0.3 * size
+
+
+def test_a_known_background_is_subtracted():
+    """A number, one for each capture, and frames; the captures stay as they were given."""
+    plain = recording(background=0.0).problem()
+    frames = np.ones((2, *SHAPE)) * np.reshape((3.0, -1.0), (2, 1, 1))
+    for offsets, known in (((3.0, 3.0), 3.0), ((3.0, -1.0), frames), ((3.0, -1.0), [3.0, -1.0])):
+        seen = recording(offsets, background=known)
+        again = dataclasses.replace(seen, noise_variance=1e-6)
+        assert float(again.captures[0][VALID[0]][0]) == float(seen.captures[0][VALID[0]][0])
+        found = again.problem()
+        assert not found.free_background
+        image = jnp.ones(plain.image_shape)
+        np.testing.assert_allclose(objective(found, image), objective(plain, image), rtol=1e-6)
+    with pytest.raises(ValueError, match=r"background has shapes .* give a number or a frame"):
+        recording(background=np.zeros((3, 4)))
+
+
+@pytest.mark.thorough
+def test_gradients_pass_through_the_background():
+    """Of the minimiser with respect to a capture's pixel, against differences.
+
+    Less its mean: a uniform image here casts a uniform capture, so that its level is anything.
+    """
+    problem = recording((3.0, -1.0), noise=0.05).problem()
+    towards = jnp.asarray(RNG.random(problem.image_shape))
+    towards = towards - jnp.mean(towards)
+
+    def projected(value):
+        captures = (problem.captures[0].at[0, 5, 6].add(value), problem.captures[1])
+        moved = eqx.tree_at(lambda p: p.captures, problem, captures)
+        start = jnp.zeros(problem.image_shape)
+        found = tc.solve_fixed_point(moved, start, iterations=20000, tolerance=1e-12)
+        return jnp.sum(found.image * towards)
+
+    slope, one = jax.grad(projected)(0.0), jnp.asarray(1.0)
+    expected = finite_difference(projected, 0 * one, one, 1e-4)
+    np.testing.assert_allclose(slope, expected, rtol=1e-3)
