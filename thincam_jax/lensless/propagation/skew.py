@@ -19,7 +19,7 @@ from thincam_jax.lensless.propagation.path import Path
 
 # What the axes may share of an order's curvature, 1 where it focuses along a line.
 _MOST_SHARED = 0.25
-# Error that corners leave, for a zone of an edge as wide as the mask and axes that share all: of 30
+# Error that corners leave, for a zone of an edge as wide as the mask and axes that share all: of 22
 # random plates at most 1.4.
 _CORNERS = 1.6
 # Of the interpolation across the shear; where a pixel's average leaves little of far edges' waves,
