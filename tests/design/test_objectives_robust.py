@@ -166,3 +166,12 @@ def test_gradient_by_differences(how):
 def test_other_ways_are_refused():
     with pytest.raises(Exception, match="median"):
         robust(Tolerances(), how="median")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("how", ["mean", "worst"])
+def test_tolerances_beyond_the_design_are_refused(how):
+    """Advice: smaller ones have a finite error."""
+    with pytest.raises(Exception, match="below zero; give tolerances that are small"):
+        robust(Tolerances(distance=2.0**63), how)
+    assert np.isfinite(robust(Tolerances(distance=1e-3), how))

@@ -141,3 +141,20 @@ def test_cells_off_both_axes():
     assert fit.truncation_error + fit.interpolation_error < 0.02
     error = np.linalg.norm(np.asarray(fit.operator(point)) - exact)
     assert error < 0.02 * np.linalg.norm(h)
+
+
+@pytest.mark.thorough
+def test_averages_count_in_the_errors():
+    """60 nodes for 450 fringes a pixel; by default as many as leave a quarter of the tolerance."""
+    camera = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, 0.3, width=1.5), CAMERA.sensor, 0.6)
+    given = {"light": 500 * nm, "object_distance": 250.0, "field_shape": (3, 4), "tolerance": 0.02}
+    few = tc.PsfMethod("separable", nodes=60)
+    found, own = tc.field_operator(camera, model=few, **given), tc.field_operator(camera, **given)
+    assert found.interpolation_error > 5e-3 > own.interpolation_error
+    fine = tc.PsfMethod("separable", nodes=700, pixel_integration=True)
+    exact = tc.psf(camera, wavelength=500 * nm, object_distance=250.0, model=fine)
+    for fit, method in ((found, few), (own, "separable")):
+        h = tc.psf(
+            camera, wavelength=500 * nm, object_distance=250.0, model=method, pixel_integration=True
+        )
+        assert relative_l2(np.asarray(h), np.asarray(exact)) < fit.interpolation_error + 1e-3

@@ -85,3 +85,18 @@ def test_frames_of_cameras(synthesis, model):
         stream, image = stream.next([1.5 * captures[0], 1.5 * captures[1]])
     alone = tc.reconstruct(tc.Recording(1.5 * captures, optics, noise_variance=1e-5), solver)
     assert relative_l2(image, alone.image) < 1e-3
+
+
+def test_captures_of_nan_are_refused():
+    """Not where they are not valid."""
+    psf, capture = np.random.default_rng(0).random((5, 5)), np.ones((1, 12, 16))
+    broken = capture.copy()
+    broken[0, 2, 3] = np.nan
+    for valid in (None, np.isfinite(broken)):
+        recording = tc.Recording(capture, tc.Psfs(psf[None]), noise_variance=0.01, valid=valid)
+        stream = tc.Stream(recording, tc.AdmmTV(0.5, iterations=10), steps=1)
+        if valid is None:
+            with pytest.raises(ValueError, match=r"captures\[0\] holds NaN .* with valid="):
+                stream.next(broken)
+        else:
+            assert np.isfinite(stream.next(broken)[1]).all()

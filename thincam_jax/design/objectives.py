@@ -216,6 +216,12 @@ class Tolerances:
     tilt: Annotated[float, quantity("rad", non_negative=True)] = 0.0
 
 
+_TOO_LARGE = (
+    "tolerances move a distance or a wavelength to below zero; give tolerances that are small "
+    "against these"
+)
+
+
 @checked
 def robust_error(
     design: Design,
@@ -245,7 +251,10 @@ def robust_error(
         return mismatch_error(known, actual)
 
     # Stacked, they are one program in place of one for each.
-    every = jax.vmap(error)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *moved))
+    designs, setups = jax.tree.map(lambda *leaves: jnp.stack(leaves), *moved)
+    lengths = designs.distance, designs.wavelength, setups.object_distance
+    lost = jnp.min(jnp.stack([jnp.min(length) for length in lengths])) <= 0
+    every = eqx.error_if(jax.vmap(error)((designs, setups)), lost, _TOO_LARGE)
     if how == "mean":
         return exact + jnp.sum(every - exact) / 2
     # Soft to a hundredth of the error: smooth where two tolerances cost the same.

@@ -20,7 +20,8 @@ def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> No
     r"""ValueError where float32 cannot represent the phase of the zones on the sensor.
 
     The fringes of the order k have the phase :math:`k\beta r^2/(M^2(1+k\epsilon))` at r on the
-    sensor, which float32 rounds by 2⁻²⁴ of itself. More than 0.05 rad is refused: the PSF would be
+    sensor, :math:`k\beta(1-k\epsilon) r^2/M^2` of "paraxial", which float32 rounds by 2⁻²⁴ of
+    itself. More than 0.05 rad is refused: the PSF would be
     wrong by several per cent. Traced numbers are not checked.
     """
     if not held_in_single(mask, grid, path, model):
@@ -51,6 +52,8 @@ def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
     ]
     found = 0.0
     for k in mask.orders:
+        if model == "paraxial":  # its phases are those of kβ(1 − kε), which grow with k²ε
+            found = max(found, abs(k) * beta * abs(1 - k * epsilon) * sum(r**2 for r in ends))
         gain = abs(1 + k * epsilon)
         if k == 0 or gain == 0 or gain > 2:  # beyond, the order is spread out and weak
             continue

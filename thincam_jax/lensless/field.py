@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Shape
+from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.operators import (
     CropConvolution,
     LowRank,
@@ -23,9 +24,10 @@ from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.light import light_over_field
 from thincam_jax.lensless.masks.base import zone_orders
-from thincam_jax.lensless.method import Model, PsfMethod, as_method
+from thincam_jax.lensless.method import Model, PsfMethod, as_method, has_few_terms
 from thincam_jax.lensless.propagation.obliquity import ERROR_PER_RADIAN, shift_variance
-from thincam_jax.lensless.psf import spectral_psf
+from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes
+from thincam_jax.lensless.psf import AVERAGES, spectral_psf
 
 # Points of the field along each axis: odd, so that the axis is one of them.
 _LEAST_POINTS, _MOST_POINTS = 3, 21
@@ -56,8 +58,9 @@ def field_operator(
     - `field_shape`: (rows, columns) of the field, on the sensor's pitch: its sample at u is the
       object's point at −u·t/d.
     - `tolerance`: relative L2 error of the PSFs over the field, at most half of it by the
-      polynomials and the rest by the sum of convolutions. With 1 the PSF is that of the axis, and
-      the light that of every point: that serves most captures, see `plan`.
+      polynomials, a quarter by the averages over pixels and the rest by the sum of convolutions.
+      Where pixels hold some 200 fringes, averages leave more, which is reported. With 1 the PSF is
+      that of the axis, and the light that of every point: that serves most captures, see `plan`.
     - `model`: of the PSFs, averaged over the pixels, see `psf`. Cells off both axes are sampled,
       with more samples by `PsfMethod("angular_spectrum", oversampling=...)`.
 
@@ -122,14 +125,27 @@ def field_fit(
         at = (-scale * y, -scale * x) if y or x else None
         return spectral_psf(camera, colours, object_distance, method, grid, at)
 
-    left = tolerance - max(between)
+    between = max(between) + _averages(camera, colours, object_distance, grid, method)
+    left = max(tolerance - between, tolerance / 8)
     maps, kernels, error = _axis_and_changes(_on_grid(camera, places, psf_at), left)
     for axis, (place, every) in enumerate(zip(places, tangents, strict=True)):
         maps = scipy.interpolate.BarycentricInterpolator(place, maps, axis=axis)(every)
     weights = np.moveaxis(maps, -1, 0) * fall
     convolution = CropConvolution(kernels, sensor.pitch, sensor.shape, field_shape, summed=1)
     found = LowRank(jnp.asarray(weights, kernels.dtype), convolution)
-    return LowRankFit(found, error, max(between))
+    return LowRankFit(found, error, between)
+
+
+def _averages(
+    camera: LenslessCamera, colours, object_distance: Number, grid: Grid, method: PsfMethod
+) -> float:
+    """Relative error of the averages over pixels that `psf` takes; 0 of samples."""
+    if method.model != "separable" or not has_few_terms(camera.mask):
+        return 0.0
+    path = camera.path(min(float(np.asarray(w)) for w, _ in colours), object_distance)
+    tolerance = AVERAGES * (method.field_tolerance or 0.0)
+    nodes = pixel_nodes(camera.mask, grid, path, method.float_type, tolerance)
+    return average_error(camera.mask, grid, path, method.nodes or nodes)
 
 
 def tangents_of(

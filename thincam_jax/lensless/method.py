@@ -37,7 +37,7 @@ UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
 SAMPLED: tuple[Model, ...] = ("angular_spectrum", "rayleigh_sommerfeld")
 CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMPLED)
 
-# Gauss-Legendre nodes a pixel for the pixel average, where the fringes are not known or many. Those
+# Gauss-Legendre nodes a pixel for the pixel average, where the fringes are not known. Those
 # of the far edge turn by up to 10 cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000
 # of the amplitude: 8 nodes are 2e-3 off there, 16 8e-5, 24 1e-10.
 PIXEL_NODES = 24
@@ -108,8 +108,8 @@ class PsfMethod:
     - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
       smallest that does. Inside jit and grad, where the mask's size is not known, it is the
       sensor's: give it there if the mask is wider than the sensor.
-    - `nodes`: of the pixel average of "separable"; by default counted. Gauss nodes an axis, or,
-      for a mask of more than 128 terms and for "radial", points a pixel (21 by default).
+    - `nodes`: of the pixel average of "separable"; by default counted (`psf`). Gauss nodes an axis,
+      or, for a mask of more than 128 terms and for "radial", points a pixel (21 by default).
     - `field_tolerance`: of captures: how far, relative, the PSFs of points off the axis may be from
       their own, which change over the field as does their light (`field_operator`). By default all
       points have the PSF and the light of the axis.

@@ -3,6 +3,7 @@
 import functools
 import math
 import operator
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -29,6 +30,7 @@ from thincam_jax.lensless.masks.base import (
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     SAMPLED,
+    AccuracyWarning,
     Model,
     PsfMethod,
     as_method,
@@ -48,9 +50,13 @@ from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommer
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
-from thincam_jax.lensless.propagation.skew import SKEW_NODES, focuses_on_a_line, skew_image
+from thincam_jax.lensless.propagation.skew import focuses_on_a_line, skew_image
 from thincam_jax.lensless.sampling import require_phase_sampling
 
+# Part of the tolerance over a field that averages over pixels may take.
+AVERAGES = 1 / 4
+# Operations of samples chosen by default, some ten seconds, that are warned of.
+_SLOW = 1e10
 # Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
 _IN_CELL, _UNKNOWN_CELL = 16, 7
 
@@ -81,7 +87,10 @@ def psf(
       "angular_spectrum" or "rayleigh_sommerfeld"; each is documented in
       `thincam_jax.lensless.propagation`. A `PsfMethod` sets the precision and the samples of a
       model, too.
-    - `pixel_integration`: average over each pixel in place of the value at its centre.
+    - `pixel_integration`: average over each pixel in place of the value at its centre; of
+      "separable" by as many nodes as its fringes need, at most 320, which leave up to 0.2 % where a
+      pixel holds more than 197, pitch·width/(λd). Where these are traced there are 24 nodes, for
+      9.5 fringes; `PsfMethod(nodes=)` sets others, `predict_error` tells what they leave.
 
     **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
     `wavelength` and `object_distance`.
@@ -231,7 +240,7 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def _sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> PsfMethod:
+def sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> PsfMethod:
     """The method; in place of "separable" samples where a mask of edges has no closed form.
 
     That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
@@ -257,14 +266,15 @@ def _sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMet
 def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
     """In the method's precision; the result comes back in the camera's."""
     mask, grid = camera.mask, camera.sensor.grid
-    method, own = _sampled_off_axis(mask, grid, path, method), precision_of(grid.pitch)
-    method = psf_method(mask, grid, method)
+    tolerance = AVERAGES * (method.field_tolerance or 0.0)
+    given, own = method, precision_of(grid.pitch)
+    method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
     averaged = method.pixel_integration and method.nodes is None
     if method.model == "separable" and averaged:
-        nodes = pixel_nodes(mask, grid, path, method.float_type)
-        method = replace(method, nodes=min(nodes, SKEW_NODES) if path.skew else nodes)
+        nodes = pixel_nodes(mask, grid, path, method.float_type, tolerance)
+        method = replace(method, nodes=nodes)
     if method.model == "radial" and method.oversampling is None:
         method = replace(method, oversampling=profile_samples(mask, grid, path, method))
     with allow(method.float_type, mask, grid, path):
@@ -272,14 +282,23 @@ def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
             mask, grid, path = cast((mask, grid, path), method.float_type)
         if method.precision == "float32":
             require_digits(mask, grid, path, method.model)
-        rows, columns = grid.shape
+        (rows, columns), cost = grid.shape, psf_cost(mask, grid, method)
         refuse_if_too_large(
             f"a PSF of {rows}×{columns} pixels by model {method.model!r}",
-            psf_cost(mask, grid, method).bytes,
+            cost.bytes,
             "use a smaller grid"
             if method.model not in SAMPLED
             else "use a smaller grid or less oversampling",
         )
+        if given.model != method.model == "angular_spectrum" and cost.flops > _SLOW:
+            few = odd_from(method.samples / 3)
+            warnings.warn(
+                f"off the axis {method.samples}×{method.samples} samples a pixel hold this "
+                f"{type(mask).__name__}, some {10 * cost.flops / _SLOW:.0f} s of a core; "
+                f"PsfMethod('angular_spectrum', oversampling={few}) takes a tenth, and is coarser",
+                AccuracyWarning,
+                stacklevel=4,
+            )
         result = function(mask, grid, path, method)
     return result if method.precision == own else cast(result, own)
 

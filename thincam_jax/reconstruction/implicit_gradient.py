@@ -29,7 +29,11 @@ from thincam_jax.reconstruction.splittings import splitting_of
 
 
 class FixedPoint(Module):
-    """The image of a fixed point, its number of iterations, and whether it converged."""
+    """The image of a fixed point, its number of iterations, and whether it converged.
+
+    Where `converged` is False, image and gradient are some per cent off: give more `iterations`,
+    or a looser `tolerance` where the gradient with twice as many is the same.
+    """
 
     image: Image
     iterations: Int[Array, ""]

@@ -128,7 +128,7 @@ class Recording(Module):
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
         if not isinstance(imaging_model, Stacked):  # operators may have masks of their own
-            self._require_finite()
+            self.require_finite()
 
     def problem(
         self,
@@ -246,7 +246,7 @@ class Recording(Module):
             if pixels != sensor:
                 raise ValueError(f"captures have {pixels} pixels, the cameras' sensor {sensor}")
 
-    def _require_finite(self) -> None:
+    def require_finite(self) -> None:
         """Require finite values in valid pixels."""
         for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
             if checks.is_traced(capture) or checks.is_traced(valid):

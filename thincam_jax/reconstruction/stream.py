@@ -41,7 +41,7 @@ class Stream(eqx.Module):
     - `steps`: m, iterations for each later capture.
 
     **Errors**: ValueError, one line, for steps below 1, a τ given by a rule, or captures of another
-    shape than the first.
+    shape than the first, or with NaN where they are valid.
 
     ```python
     import numpy as np
@@ -93,7 +93,9 @@ class Stream(eqx.Module):
                 f"captures have shapes {shapes}, the first recording's {wanted}; give captures of "
                 "the same camera, or start another stream"
             )
-        state, image = _next(self, tuple(jnp.asarray(c) for c in given))
+        given = tuple(jnp.asarray(c) for c in given)
+        replace(self.recording, captures=given).require_finite()
+        state, image = _next(self, given)
         return eqx.tree_at(lambda s: s.state, self, state), image
 
 

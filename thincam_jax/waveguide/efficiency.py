@@ -16,6 +16,15 @@ the Bragg condition.
 For TM, s′ is the ray mirrored at the fringes also off the Bragg condition, where the wave vector
 βs − K of the diffracted wave has another direction. With that direction η differs by up to 0.007 at
 Δn = 0.02 and 0.015 at 0.03 (film of 16 µm, rays within 10° in air); ghost weights by 0.1 %.
+
+Off the Bragg condition ϑ is of first order. Against rigorous coupled waves (TE, four orders, the
+same film and rays) η differs by up to 0.03, 0.08, 0.17 at Δn = 0.012, 0.02, 0.03, its integral over
+the band by 0.7 % at most. The diffracted wave that leaves the film along :math:`\mathbf s_d`, with
+the tangential part of βs − K, has the exact phase
+
+.. math:: \xi = \tfrac T2\,(\beta s_z + \beta |s_{d,z}| - K_z), \qquad c_S = s_{d,z}
+
+("exact"): 0.0013, 0.007, 0.027, and 0.14 %.
 """
 
 import math
@@ -33,6 +42,7 @@ from thincam_jax._core.precision import phasor
 from thincam_jax.waveguide.hologram import VolumeHologram, directions
 
 Polarisation = Literal["TE", "TM"]
+Phase = Literal["kogelnik", "exact"]
 
 # Rays whose bands are in memory together.
 _RAYS = 384
@@ -44,13 +54,19 @@ def diffraction_efficiency(
     tangential: Float[Array, "*ray 2"],
     wavelength: Float[Array, "*ray"],
     polarisation: Polarisation = "TE",
+    phase: Phase = "kogelnik",
 ) -> Float[Array, "*ray"]:
     """η of light from air with direction cosines (x, y), at a wavelength in mm: from 0 to 1.
 
     0 where no wave is diffracted back (c_S ≥ 0): there it would be a transmission hologram.
+
+    - `phase`: "kogelnik", as bands and ghost weights have it: within 0.03 of rigorous coupled waves
+      at Δn = 0.012, 0.08 at 0.02, 0.17 at 0.03, integrals within 0.7 %. "exact", of the diffracted
+      wave's own direction, for single rays: 0.0013, 0.007, 0.027 (TE; a film of 16 µm).
     """
     checks.choice("polarisation", polarisation, ("TE", "TM"))
-    strength, detuning, overlap, reflected = _coupling(hologram, tangential, wavelength)
+    exact = checks.choice("phase", phase, ("kogelnik", "exact")) == "exact"
+    strength, detuning, overlap, reflected = _coupling(hologram, tangential, wavelength, exact)
     overlap = overlap if polarisation == "TM" else 1.0
     return _efficiency(strength * overlap, detuning, reflected)
 
@@ -160,7 +176,7 @@ def unpolarised(hologram: VolumeHologram, tangential: Array, wavelength: Array) 
     return [_efficiency(nu, detuning, reflected) for nu in (strength, strength * overlap)]
 
 
-def _coupling(hologram, tangential, wavelength):
+def _coupling(hologram, tangential, wavelength, exact=False):
     """ν of TE, ξ, the factor |s·s′| of ν for TM, and whether a wave is diffracted back."""
     index, power = hologram.index(wavelength), jnp.sum(hologram.grating**2)
     upright = jnp.sqrt(index**2 - jnp.sum(tangential**2, axis=-1))
@@ -170,8 +186,14 @@ def _coupling(hologram, tangential, wavelength):
     wavenumber = 2 * jnp.pi * index / wavelength
     back = hologram.grating[2] / wavenumber - incident  # −c_S
     reflected = back > 0
-    back = jnp.where(reflected, back, 1.0)
     detuning = along - power / (2 * wavenumber)
+    if exact:
+        leaving = wavenumber[..., None] / index[..., None] * tangential - hologram.grating[:2]
+        squared = 1 - jnp.sum((leaving / wavenumber[..., None]) ** 2, axis=-1)
+        reflected &= squared > 0
+        back = jnp.sqrt(jnp.where(reflected, squared, 1.0))
+        detuning = (wavenumber * (incident + back) - hologram.grating[2]) * back
+    back = jnp.where(reflected, back, 1.0)
     strength = jnp.pi * hologram.index_modulation * hologram.thickness / wavelength
     overlap = jnp.abs(1 - 2 * along**2 / jnp.where(power > 0, power, 1))
     return (

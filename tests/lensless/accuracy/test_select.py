@@ -13,7 +13,7 @@ from lensless.accuracy import cameras
 import thincam_jax as tc
 from helpers import in_full, relative_l2
 from thincam_jax.lensless.accuracy.select import predict_cost, predicted_error, probe_of
-from thincam_jax.lensless.method import psf_method
+from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 
 CLOSED = ("geometric", "paraxial", "closed_form", "separable")
@@ -310,6 +310,28 @@ def test_traced_numbers_are_refused(call):
     with pytest.raises(TypeError, match="outside of jit and grad") as error:
         inside(jnp.asarray(6.5))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("at", [None, (0.0, 6.0), (1e-9, 1e-9), (6.0, 9.0)])
+@pytest.mark.parametrize("nodes", [12, 24])
+def test_predicted_errors_of_points_off_the_axis(at, nodes):
+    """Of few nodes, where 44.7 fringes cross a pixel."""
+    camera = camera_of((6, 8), 102.8e-3, distance=2.3, beta=160.0, width=0.5)
+    light = {"wavelength": 500e-6, "object_distance": 40.0, "at": at, "pixel_integration": True}
+    few = PsfMethod("separable", nodes=nodes)
+    exact = tc.psf(camera, model=PsfMethod("separable", nodes=128), **light)
+    true = relative_l2(np.asarray(tc.psf(camera, model=few, **light)), np.asarray(exact))
+    assert true < tc.predict_error(camera, model=few, **light).predicted_error < 3 * true
+    assert tc.predict_error(camera, model="separable", **light).predicted_error < 1e-3
+
+
+def test_samples_off_the_axis_are_not_predicted():
+    camera = tc.LenslessCamera(tc.Pinhole(0.5), tc.Sensor((9, 12), 0.05), 5.0)
+    light = {"wavelength": 500e-6, "model": "separable"}
+    with pytest.raises(ValueError, match="'angular_spectrum'.* on the axis only: leave `at` out"):
+        tc.predict_error(camera, at=(0.1, 0.2), **light)
+    assert tc.predict_error(camera, **light).predicted_error < 1e-5
 
 
 def test_predictions_are_of_masks_of_few_terms():

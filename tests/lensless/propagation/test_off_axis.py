@@ -265,6 +265,27 @@ def test_averages_are_means_over_points_of_a_pixel(pitch, most):
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize(("pitch", "shape"), [(25, (18, 22)), (40.5, (11, 13)), (102.8, (6, 8))])
+def test_averages_follow_the_fringes_of_a_pixel(pitch, shape):
+    """10.9, 17.6 and 44.7 fringes: 12 nodes left 0.8 to 3 %. One point has one PSF."""
+    mask = tc.FresnelZoneAperture(160.0, 0.4, width=0.5)
+    light = {"wavelength": 500 * nm, "object_distance": 40.0}
+    camera = tc.LenslessCamera(mask, tc.Sensor(shape, pitch * um), 2.3)
+    points = round(9 * pitch * 0.5 / 1.15) // 2 * 2 + 1
+    rows, columns = shape
+    fine = camera.on_grid(tc.Grid((rows * points, columns * points), pitch * um / points))
+    exact = np.asarray(tc.psf(fine, at=(1.5, 2.0), **light))
+    exact = exact.reshape(rows, points, columns, points).mean((1, 3))
+    averaged = light | {"pixel_integration": True}
+    found = np.asarray(tc.psf(camera, at=(1.5, 2.0), **averaged))
+    assert relative(found, exact) < 2e-4
+    plain = tc.psf(camera, **averaged)
+    traced = jax.jit(lambda at: tc.psf(camera, at=at, **averaged))(jnp.zeros(2))
+    assert relative(tc.psf(camera, at=(1e-9, 1e-9), **averaged), plain) < 1e-6
+    assert relative(traced, plain) < 1e-6
+
+
+@pytest.mark.thorough
 def test_averages_have_slopes_and_one_program():
     """The slope against a difference, of the angle and of β."""
     weights = np.random.default_rng(0).normal(size=SENSOR.shape)
@@ -439,6 +460,20 @@ def test_lenses_off_both_axes_name_the_sampled_model():
         tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1))
     h = tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1), model="angular_spectrum")
     assert np.all(np.isfinite(h))
+
+
+@pytest.mark.thorough
+def test_slow_samples_are_told_beforehand(monkeypatch):
+    """With the samples that are named, without a word."""
+    monkeypatch.setattr("thincam_jax.lensless.psf._SLOW", 1e8)
+    camera, light = tc.LenslessCamera(mura(), SENSOR, DISTANCE), {"wavelength": 500 * nm}
+    light |= {"at": (0.03, 0.04)}
+    with pytest.warns(AccuracyWarning, match=r"35×35 samples .* oversampling=13\) takes a tenth"):
+        fine = tc.psf(camera, pixel_integration=True, **light)
+    coarse = tc.PsfMethod("angular_spectrum", oversampling=13, pixel_integration=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert relative(tc.psf(camera, model=coarse, **light), fine) < 0.1
 
 
 def test_steep_light_is_warned_of():

@@ -1,17 +1,20 @@
 """The exact PSF of the square aperture, against evaluations that share nothing with it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from lensless.accuracy.cameras import pixel_average
 from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation import Path
-from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
+from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes, separable
 
 INF = float("inf")
 THESIS = {"beta": 25.0, "width": 5.632, "distance": 6.5, "wavelength": 500e-6}
@@ -248,6 +251,47 @@ def test_pixel_nodes_follow_the_fringes_in_a_pixel():
     jax.jit(lambda distance: look(small, distance))(6.5)
     look(camera_of((256, 200), PITCH, THESIS), 6.5)
     assert found == [10, 10, PIXEL_NODES, PIXEL_NODES]
+
+
+def test_more_nodes_follow_more_fringes_or_leave_a_tolerance():
+    """10.9, 17.6, 44.7 and 12,000 fringes a pixel; nodes that do not follow them are told of."""
+    found = []
+    for width, pitch, distance in (
+        (0.5, 25, 2.3),
+        (0.5, 40.5, 2.3),
+        (0.5, 102.8, 2.3),
+        (1, 300, 0.05),
+    ):
+        camera = camera_of(
+            (9, 12), pitch * 1e-3, {"beta": 160.0, "width": width, "distance": distance}
+        )
+        given = camera.mask, camera.sensor.grid, camera.path(500e-6, 40.0)
+        nodes = pixel_nodes(*given, "float32")
+        found.append(nodes)
+        few = pixel_nodes(*given, "float32", 0.01)
+        assert few <= nodes and average_error(*given, few) <= 0.01
+        assert (average_error(*given, nodes) == 0) == (nodes < 320)
+        assert average_error(*given, 12) > average_error(*given, 20) > 0
+    assert found == [32, 48, 96, 320]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("distance", [0.05, 0.2, 2.3])
+def test_averages_of_coarse_pixels_near_the_mask(distance):
+    """Against pixels in pieces; 24 nodes were 3 % off at 0.05 mm. Of light, all arrives."""
+    mask = tc.FresnelZoneAperture(60.0, 0.4, width=1.0, height=0.8)
+    camera = tc.LenslessCamera(mask, tc.Sensor((9, 12), 0.3), distance)
+    found = tc.psf(camera, wavelength=500e-6, pixel_integration=True)
+    geometry = {"beta": 60.0, "width": 1.0, "height": 0.8, "distance": distance}
+    geometry |= {"wavelength": 500e-6, "object_distance": INF, "phase": 0.4, "centre": (0, 0)}
+    exact = pixel_average((9, 12), 0.3, orders=reference.COSINE, **geometry)
+    assert relative_l2(found, exact) < 2e-3
+    near = dataclasses.replace(camera, distance=4e-7)
+    lit, shadow = (
+        float(jnp.sum(tc.psf(near, wavelength=500e-6, pixel_integration=True, model=model)))
+        for model in ("separable", "geometric")
+    )
+    assert lit == pytest.approx(shadow, rel=2e-3)
 
 
 @pytest.mark.thorough

@@ -139,7 +139,8 @@ class LowRankFit(eqx.Module):
     - `truncation_error`: of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.
     - `interpolation_error`: an estimate of the same between the points. Of measured PSFs a quarter
       of the error where every other point is omitted and interpolated, infinite for grids too small
-      for it; of a camera's field, what the polynomials leave of the finest zones' phase.
+      for it; of a camera's field, what the polynomials leave of the finest zones' phase, and
+      what few nodes leave of averages over pixels.
     """
 
     operator: LowRank

@@ -27,13 +27,14 @@ from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
+from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 from thincam_jax.lensless.psf import closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
 _FINE_SAMPLES = 2**16
 # Nodes of the reference's pixel average: few different ones, each is compiled.
-_NODES = (2 * PIXEL_NODES, 128, 320)
+_NODES = (2 * PIXEL_NODES, 128, 320, 960)
 # Samples across a pixel for its average there.
 _IN_PIXEL = 33
 # Rows and columns of pixels at which the direct sum is tried.
@@ -76,10 +77,11 @@ class Numbers:
 def lines_of(mask: AbstractFactoredMask, grid: Grid, path: Path) -> Lines:
     """Rows and columns of the grid, denser at the edges of the shadow."""
     pitch, scale = float(grid.pitch), float(path.magnification)
+    shadow = path.on_mask(grid, mask.centre)
     zone = 3 * math.sqrt(float(path.wavelength * path.distance) * scale) / pitch
     found = []
     for axis, count in enumerate(grid.shape):
-        middle = (count - 1) / 2 + scale * float(mask.centre[axis]) / pitch
+        middle = -scale * float(shadow[axis][0]) / pitch
         half = scale * float(mask.extent[axis]) / 2 / pitch
         indices, weights = chosen(count, (middle - half, middle + half), zone, seed=axis)
         found.append((indices - (count - 1) / 2, weights))
@@ -199,6 +201,8 @@ class MaskProbe:
     ) -> None:
         self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
         self.lines = lines_of(mask, grid, path)
+        # Those of few fringes differ by rounding, and each count is compiled.
+        self.nodes = max(PIXEL_NODES, pixel_nodes(mask, grid, path, "float64"))
         self.given: dict[Precision, tuple[AbstractFactoredMask, Array, Path]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
@@ -209,8 +213,9 @@ class MaskProbe:
         """‖h‖₂ of the reference; where no light falls on the sensor, errors count as they are."""
         return norm(self.reference) or 1.0
 
-    def closed(self, model: Model, precision: Precision, nodes: int = PIXEL_NODES) -> Factors:
-        """Factors of one of the closed forms."""
+    def closed(self, model: Model, precision: Precision, nodes: int | None = None) -> Factors:
+        """Factors of one of the closed forms, averages by default as `psf` has them."""
+        nodes = nodes or self.nodes
         key = model, precision, nodes
         if key not in self._cache:
             with allow(precision):
@@ -225,7 +230,7 @@ class MaskProbe:
     def reference(self) -> Factors:
         """`separable` in double precision, pixels averaged with as many nodes as the fringes ask.
 
-        Where a pixel holds more than some ten fringes of the far edge, those of `psf` alias them.
+        Where a pixel holds more than some 200 fringes of the far edge, those of `psf` alias them.
         """
         return self.closed("separable", "float64", self._nodes)
 
@@ -244,9 +249,9 @@ class MaskProbe:
     def _factors(self, terms: SeparableSum) -> Factors:
         return factors(terms, self.lines.row_weights, self.lines.column_weights)
 
-    def model_error(self, model: Model) -> float:
+    def model_error(self, model: Model, nodes: int | None = None) -> float:
         """Relative distance of a closed form from the reference, without rounding."""
-        found = self.closed(model, "float64")
+        found = self.closed(model, "float64", nodes)
         if model == "separable":
             return rounding_distance(found, self.reference) / self.scale
         return distance(found, self.reference) / self.scale
@@ -281,7 +286,8 @@ class MaskProbe:
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
             points = SparseGrid(few[0], few[1], pitch)
-            separable = PsfMethod("separable", "float64", self.pixel_integration)
+            averaged = self.pixel_integration
+            separable = PsfMethod("separable", "float64", averaged, nodes=self.nodes)
             exact = np.asarray(closed_terms(mask, points, path, separable).image())
         with allow(method.float_type):
             mask, pitch, path = self.given[method.float_type]

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import available_bytes
 from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, precision_of
@@ -19,7 +19,7 @@ from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
 from thincam_jax.lensless.method import (
-    PIXEL_NODES,
+    SAMPLED,
     Model,
     PsfMethod,
     as_method,
@@ -28,6 +28,9 @@ from thincam_jax.lensless.method import (
     parts_of,
     psf_method,
 )
+from thincam_jax.lensless.propagation.obliquity import require_off_axis
+from thincam_jax.lensless.propagation.skew import corner_error
+from thincam_jax.lensless.psf import sampled_off_axis
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.
@@ -157,11 +160,18 @@ def predict_error(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
+    at: Position | None = None,
     model: Model | PsfMethod,
     pixel_integration: bool = False,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments as for `psf`, reference as for
     `select_model`.
+
+    `at` is for "separable" and "geometric", against the exact field to second order about the ray.
+    Off both axes the waves of a plate's corners count, which it leaves out (`corner_error`).
+
+    **Errors**: as `select_model`; ValueError for samples off the axis, by which "separable" has
+    cells off both axes.
 
     ```python
     import thincam_jax as tc
@@ -176,10 +186,19 @@ def predict_error(
     **See also**: `select_model`.
     """
     average = as_method(model, pixel_integration).pixel_integration
-    probe = probe_of(camera, wavelength, object_distance, average)
-    grid = camera.sensor.grid
-    method = psf_method(camera.mask, grid, model, average)
+    probe = probe_of(camera, wavelength, object_distance, average, at)
+    grid, path = camera.sensor.grid, camera.path(wavelength, object_distance, at)
+    method = sampled_off_axis(camera.mask, grid, path, as_method(model))
+    method = psf_method(camera.mask, grid, method, average)
+    require_off_axis(camera.mask, path, method.model)
+    if at is not None and method.model in SAMPLED:
+        raise ValueError(
+            f"errors of samples ({method.model!r}) are predicted on the axis only: leave `at` out, "
+            "or compare psf with itself at more oversampling"
+        )
     error = predicted_error(probe, camera.mask, grid, method)
+    if path.skew and method.model == "separable":
+        error += corner_error(camera.mask, path, float(grid.pitch) * average)
     return Prediction(method, error, psf_cost(camera.mask, grid, method))
 
 
@@ -278,11 +297,15 @@ def require_camera(camera: LenslessCamera, function: str) -> AbstractFactoredMas
 
 
 def probe_of(
-    camera: LenslessCamera, wavelength: Number, object_distance: Number, pixel_integration: bool
+    camera: LenslessCamera,
+    wavelength: Number,
+    object_distance: Number,
+    pixel_integration: bool,
+    at: Position | None = None,
 ) -> MaskProbe:
-    """The probe of a camera whose numbers are known."""
+    """The probe of a camera whose numbers are known, off both axes with products of both."""
     mask = require_camera(camera, "select_model")
-    path = camera.path(wavelength, object_distance)
+    path = replace(camera.path(wavelength, object_distance, at), skew=False)
     grid = camera.sensor.grid
     _require_known((camera, path, grid))
     return MaskProbe(mask, grid, path, pixel_integration=pixel_integration)
@@ -324,7 +347,7 @@ def predicted_error(probe: MaskProbe, mask: AbstractMask, grid: Grid, method: Ps
         return _MARGIN[model] * probe.rayleigh_sommerfeld(method)
     if model == "closed_form" and probe.in_focus():
         return math.inf  # `psf` refuses it
-    error = probe.model_error(model) + probe.rounding(model, precision)
+    error = probe.model_error(model, method.nodes) + probe.rounding(model, precision)
     return _MARGIN_CLOSED * error + RESULT_ROUNDING[precision_of(grid.pitch)]
 
 
@@ -363,7 +386,7 @@ def _optics_left_out(probe: MaskProbe, model: Model) -> list[str]:
         if not probe.pixel_integration:
             return []
         size = probe.model_error("separable")
-        return [f"a pixel's average is taken at up to {PIXEL_NODES} points an axis: {size:.1e}"]
+        return [f"a pixel's average is taken at up to {probe.nodes} points an axis: {size:.1e}"]
     edge = probe.model_error("closed_form")
     effects = [f"the aperture's edge is left out ({zone}): {edge:.1e}"]
     if model == "paraxial":

@@ -26,14 +26,12 @@ from thincam_jax.lensless.masks.base import (
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
 from thincam_jax.lensless.plan.transfer import TransferProbe, image_spectrum
-from thincam_jax.lensless.propagation.skew import SKEW_NODES
 
 # Parts of the field's half width where the change is looked at, and the powers of its polynomial.
 _PARTS = (-1.0, -math.sqrt(0.5), math.sqrt(0.5), 1.0)
 _POWERS = (1, 2, 3, 4)
-# Error of a pixel's average by n nodes an axis is this over n, where a pixel holds many fringes.
-_AVERAGE = 0.2
-_MOST_NODES, _LARGEST = 133, 0.3
+# Errors of the PSFs between which the tolerance is kept.
+_SMALLEST, _LARGEST = 3e-3, 0.3
 # Error of the PSFs of cells off both axes, which are sampled.
 _CELLS = 0.03
 # What the two axes tell of the corners' changes behind masks without zones.
@@ -84,10 +82,9 @@ def _own(seen: SeenScene, method: PsfMethod, share: float) -> tuple[PsfMethod, f
     """The method of every point's own PSF, and its relative error; infinite of lenses."""
     mask = seen.camera.mask
     if zone_orders(mask) is not None:
-        share = min(max(share, 2 * _AVERAGE / _MOST_NODES), _LARGEST)
-        nodes = max(SKEW_NODES, math.ceil(2 * _AVERAGE / share))
-        own = PsfMethod("separable", method.precision, True, nodes=nodes)
-        return replace(own, field_tolerance=share / 2), share
+        share = min(max(share, _SMALLEST), _LARGEST)
+        own = PsfMethod("separable", method.precision, True, field_tolerance=share / 2)
+        return own, share
     if _has_chirps(mask):
         return method, math.inf
     if isinstance(mask, AbstractFactoredMask):

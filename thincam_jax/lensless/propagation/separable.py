@@ -1,5 +1,7 @@
 r"""`separable`: the exact Fresnel field of a mask of few separable terms, in closed form."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,22 +23,53 @@ _FEWER: dict[Precision, dict[int, float]] = {
     "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
     "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},
 }
+# More nodes, and how many more than half of π times the fringes they must be to follow these. At
+# their end what they leave of a PSF, times their count and the root of the mask's width in pixels:
+# an edge is in so many pixels.
+_MORE, _BEYOND, _LEFT = (PIXEL_NODES, 32, 48, 64, 96, 128, 192, 320), 9.0, 1.25
 # Rows and columns up to which a core computes both as fast as two.
 _SMALL = 1024
 
 
-def pixel_nodes(mask: AbstractMask, grid: Grid, path: Path, precision: Precision) -> int:
+def pixel_nodes(
+    mask: AbstractMask, grid: Grid, path: Path, precision: Precision, tolerance: float = 0.0
+) -> int:
     """Nodes that the pixel average needs; `PIXEL_NODES` while the numbers are traced.
+
+    As many as follow its fringes, at most 320, or fewer that leave the tolerance.
+    """
+    known = _fringes(mask, grid, path)
+    if known is None:
+        return PIXEL_NODES
+    fringes, left = known
+    few = [n for n, most in _FEWER[precision].items() if fringes <= most]
+    few += [n for n in _MORE if _follow(n, fringes) or left <= tolerance * n]
+    return next(iter(few), _MORE[-1])
+
+
+def average_error(mask: AbstractMask, grid: Grid, path: Path, nodes: int) -> float:
+    """Relative error of the PSF, of nodes that do not follow the fringes; 0 of others."""
+    known = _fringes(mask, grid, path)
+    return 0.0 if known is None or _follow(nodes, known[0]) else known[1] / nodes
+
+
+def _follow(nodes: int, fringes: float) -> bool:
+    few = _FEWER["float32"].get(nodes, 0.0)
+    return fringes <= few or nodes >= fringes * math.pi / 2 + _BEYOND
+
+
+def _fringes(mask: AbstractMask, grid: Grid, path: Path) -> tuple[float, float] | None:
+    """Fringes a pixel and the error of one node; None while the numbers are traced.
 
     The band of the irradiance ends at width/(λd): so many fringes there are at most.
     """
     numbers = (*mask.extent, grid.pitch, path.wavelength, path.distance)
     if any(checks.is_traced(number) for number in numbers):
-        return PIXEL_NODES
+        return None
     # In NumPy: inside jit, JAX would trace the product of known numbers too.
     height, width, pitch, wavelength, distance = (float(np.asarray(n)) for n in numbers)
     fringes = pitch * max(height, width) / (wavelength * distance)
-    return next((n for n, most in _FEWER[precision].items() if fringes <= most), PIXEL_NODES)
+    return fringes, _LEFT * math.sqrt(pitch / min(height, width))
 
 
 @jax.jit

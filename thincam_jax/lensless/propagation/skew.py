@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core import checks
@@ -17,11 +17,11 @@ from thincam_jax.lensless.masks.base import AbstractMask, pairs, zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import Path
 
-# Gauss nodes an axis of a pixel's average, at most: 7e-4 of the PSF off where a pixel holds ten
-# fringes of the far edge, 3e-3 where it holds forty.
-SKEW_NODES = 12
 # What the axes may share of an order's curvature, 1 where it focuses along a line.
 _MOST_SHARED = 0.25
+# Error that corners leave, for a zone of an edge as wide as the mask and axes that share all: of 22
+# random plates at most 1.4.
+_CORNERS = 1.6
 # Of the interpolation across the shear; where a pixel's average leaves little of far edges' waves,
 # those of the first orders need fewer.
 _NODES, _FEW_NODES = 32, 16
@@ -35,7 +35,7 @@ def focuses_on_a_line(mask: AbstractMask, path: Path) -> bool:
         return False
     with jax.ensure_compile_time_eval():
         zones, ray = zone_orders(mask), path.chief_ray(mask.centre)
-        return zones is not None and bool(_is_line(*_curvatures(zones, ray, path)))
+        return zones is not None and bool(_shared(*_curvatures(zones, ray, path)) > _MOST_SHARED)
 
 
 def _curvatures(zones, ray, path: Path):
@@ -45,9 +45,26 @@ def _curvatures(zones, ray, path: Path):
     return matrix, jnp.asarray(zones.orders, zones.beta.dtype) * zones.beta
 
 
-def _is_line(matrix, curvatures) -> Bool[Array, ""]:
+def _shared(matrix, curvatures) -> Float[Array, ""]:
+    """What the axes share of an order's curvature, at most."""
     shared = matrix[2] ** 2 / ((curvatures + matrix[0]) * (curvatures + matrix[1]))
-    return jnp.max(jnp.abs(shared)) > _MOST_SHARED
+    return jnp.max(jnp.abs(shared))
+
+
+def corner_error(mask: AbstractMask, path: Path, pixel: float) -> float:
+    r"""Relative error of `skew_image`, about at most, by the waves of the mask's corners.
+
+    They have another phase beyond a distance of :math:`l = z\sigma^{-1/4}` from both edges, with
+    :math:`z^2 = \lambda d/M` and :math:`\sigma = A_{xy}^2/A_{xx}A_{yy}`: of a plate w wide that
+    is :math:`z^2/lw` of the PSF, and :math:`z^2/\pi lp` of this in averages over p (`pixel`).
+    """
+    zones, ray = zone_orders(mask), path.chief_ray(mask.centre)
+    if zones is None or ray is None:
+        return 0.0
+    shared = _shared(*_curvatures(zones, ray, path)) ** 0.25
+    reached = jnp.sqrt(np.pi / path.fresnel_curvature) * shared  # z²/l
+    kept = jnp.minimum(1.0, reached / (np.pi * pixel)) if pixel else 1.0
+    return float(_CORNERS * reached / jnp.minimum(*mask.extent) * kept)
 
 
 def skew_image(
@@ -87,7 +104,7 @@ def skew_image(
     matrix, curvatures = _curvatures(zones, ray, path)
     curvatures = eqx.error_if(
         curvatures,
-        _is_line(matrix, curvatures),
+        _shared(matrix, curvatures) > _MOST_SHARED,
         "model 'separable' has no PSF for a point off both axes where an order focuses nearly on "
         "the sensor; use 'angular_spectrum'",
     )
