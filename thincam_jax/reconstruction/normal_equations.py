@@ -111,7 +111,7 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
         assert modes is not None
         values = jnp.abs(_gain(fixed.operators[0])) * modes.values
         weighted = replace(modes, values=jnp.sqrt(jnp.mean(fixed.weights[0])) * values)
-        closed = bare[0].terms == 1 and not fixed.free_background
+        closed = bare[0].terms == 1 and not fixed.has_background
         if closed and fixed.weights[0].size == 1:
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
@@ -327,7 +327,7 @@ def _gain(operator: AbstractOperator):
 
 @jax.jit
 def _gram(problem: InverseProblem) -> Float[Array, "n n"]:
-    """Σ AᵀwA; with free backgrounds, of columns of A less their means by the weights."""
+    """Σ AᵀwA; with backgrounds to find, of columns of A less their means by the weights."""
     parts = []
     for operator, weight in _weighted(problem):
         bare, gain = _bare(operator), _gain(operator)
@@ -342,7 +342,7 @@ def _gram(problem: InverseProblem) -> Float[Array, "n n"]:
             rows = jnp.broadcast_to(rows, detector_shape(operator)).reshape(-1, 1)
             parts.append(gain**2 * product(matrix.T, rows * matrix))
             total, pulled = gain**2 * jnp.sum(rows), gain**2 * jnp.sum(rows * matrix, axis=0)
-        if problem.free_background:
+        if problem.has_background:
             parts.append(-jnp.outer(pulled, pulled) / or_one(total))
     return sum(parts[1:], start=parts[0])
 

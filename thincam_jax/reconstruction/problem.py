@@ -1,7 +1,7 @@
 """The inverse problem of a reconstruction, for any camera with a linear operator."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -16,6 +16,8 @@ from thincam_jax.imaging.operators.base import is_shape
 from thincam_jax.imaging.operators.separable import Separable
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
+
+Background = Literal["known", "unknown", "nonnegative"]
 
 
 class InverseProblem(eqx.Module):
@@ -47,9 +49,10 @@ class InverseProblem(eqx.Module):
     - `tau`: τ ≥ 0, relative.
     - `regulariser`: R; default isotropic total variation.
     - `nonnegative`: whether to constrain f ≥ 0.
-    - `free_background`: whether each capture and channel has a uniform background b_k that is not
-      known. The least squares are then those of A_k f + b_k − g_k with the best b_k, the mean of
-      the residual by weights w_k, for every f.
+    - `background`: "known", and subtracted; or each capture and channel has a uniform background
+      b_k that is "unknown", or "nonnegative". The least squares are then those of A_k f + b_k − g_k
+      with the best b_k for every f, the mean of what is missing by the weights w_k, or 0. Linear
+      methods take it without the constraint.
 
     **Errors**: ValueError, one line, where operators and captures do not fit.
 
@@ -73,7 +76,7 @@ class InverseProblem(eqx.Module):
     tau_unit: Float[Array, ""]
     regulariser: AbstractRegulariser
     nonnegative: bool = eqx.field(static=True)
-    free_background: bool = eqx.field(static=True)
+    background: Background = eqx.field(static=True)
 
     def __init__(
         self,
@@ -84,7 +87,7 @@ class InverseProblem(eqx.Module):
         tau: Number = 2.0,
         regulariser: AbstractRegulariser | None = None,
         nonnegative: bool = True,
-        free_background: bool = False,
+        background: Background = "known",
     ):
         operators = [operators] if isinstance(operators, AbstractOperator) else list(operators)
         captures = list(captures) if isinstance(captures, tuple | list) else [captures]
@@ -113,7 +116,12 @@ class InverseProblem(eqx.Module):
         self.tau = checks.non_negative("tau", tau, "a ratio").astype(dtype)
         self.tau_unit = backprojected_noise(self.operators, self.weights).astype(dtype)
         self.regulariser = TotalVariation() if regulariser is None else regulariser
-        self.nonnegative, self.free_background = nonnegative, free_background
+        self.nonnegative, self.background = nonnegative, background
+
+    @property
+    def has_background(self) -> bool:
+        """Whether there is a background to find."""
+        return self.background != "known"
 
     @property
     def absolute_tau(self) -> Float[Array, ""]:
@@ -169,22 +177,32 @@ def back_project(operator: AbstractOperator, capture: Float[Array, "..."]) -> Fl
 
 
 def residuals(problem: InverseProblem, image: Image):
-    """A_k f + b_k − g_k of every capture; b_k = 0 without a free background."""
-    differences = [
-        forward(operator, image) - capture
-        for operator, capture in zip(problem.operators, problem.captures, strict=True)
-    ]
-    return without_background(problem, differences)
+    """A_k f + b_k − g_k of every capture, with the background b_k that fits best."""
+    parts = zip(problem.operators, problem.captures, problem.weights, strict=True)
+    return tuple(
+        with_background(problem.background, w, forward(o, image) - g, len(detector_shape(o)))
+        for o, g, w in parts
+    )
+
+
+def with_background(
+    background: Background, weight: Float[Array, "..."], difference: Float[Array, "..."], axes: int
+) -> Float[Array, "..."]:
+    """A f + b − g of the difference A f − g, over its last axes."""
+    if background == "known":
+        return difference
+    level = weighted_mean(weight, difference, axes)
+    return difference - (jnp.minimum(level, 0) if background == "nonnegative" else level)
 
 
 def without_background(
     problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
 ) -> tuple[Float[Array, "..."], ...]:
-    """Captures less their means by the weights, where the background is free."""
-    if not problem.free_background:
+    """Captures less their means by the weights, where there is a background to find."""
+    if not problem.has_background:
         return tuple(differences)
     parts = zip(problem.operators, problem.weights, differences, strict=True)
-    return tuple(d - weighted_mean(w, d, len(detector_shape(o))) for o, w, d in parts)
+    return tuple(with_background("unknown", w, d, len(detector_shape(o))) for o, w, d in parts)
 
 
 def weighted_mean(
@@ -200,16 +218,19 @@ def weighted_mean(
 def back_projected(
     problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
 ) -> Float[Array, "..."]:
-    r""":math:`\sum_k A_k^T w_k d_k`, of captures without their free background."""
-    known = without_background(problem, differences)
-    parts = zip(problem.operators, problem.weights, known, strict=True)
+    r""":math:`\sum_k A_k^T w_k d_k`, of captures without their background."""
+    return _spread(problem, without_background(problem, differences))
+
+
+def _spread(problem: InverseProblem, differences: Sequence[Float[Array, "..."]]):
+    parts = zip(problem.operators, problem.weights, differences, strict=True)
     first, *others = [back_project(operator, w * d) for operator, w, d in parts]
     return sum(others, start=first)
 
 
 def gradient(problem: InverseProblem, image: Image):
     r"""Gradient of the misfit, :math:`\sum_k A_k^T w_k (A_k f - g_k)`."""
-    return back_projected(problem, residuals(problem, image))
+    return _spread(problem, residuals(problem, image))
 
 
 def misfit(problem: InverseProblem, image: Image):
@@ -265,7 +286,7 @@ _UNEVEN = 1e-3
 def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
     r"""The brightness of a uniform image that explains each channel best, by least squares.
 
-    Where a free background would explain it as well, the brightness is that of an image of full
+    Where a background would explain it as well, the brightness is that of an image of full
     contrast: between :math:`\sigma_g/\sum h`, where its detail is coarser than the PSF h, and
     :math:`\sigma_g/(\sum h^2)^{1/2}`, where its pixels vary independently, the geometric mean.
     """
@@ -275,7 +296,7 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
     ):
         axes = tuple(range(-len(detector_shape(operator)), 0))
         flat = forward(operator, jnp.ones((1,) * 4, capture.dtype))
-        if problem.free_background:
+        if problem.has_background:
             whole, uneven = flat, flat - weighted_mean(weight, flat, len(axes))
             even = weighted_mean(weight, flat**2, len(axes))
             shown = weighted_mean(weight, uneven**2, len(axes)) > _UNEVEN * even
@@ -284,9 +305,7 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
             gain = jnp.sqrt(or_one(jnp.sqrt(even * operator.mean_power())))
             flat = jnp.where(shown, uneven, whole)
             capture = jnp.where(shown, capture, spread / gain * whole)
-        if (
-            isinstance(operator, Separable) and weight.size == 1 and not problem.free_background
-        ):  # by products, which are faster
+        elif isinstance(operator, Separable) and weight.size == 1:  # by products, which are faster
             rows, columns = operator.left.sum(axis=2), operator.right.sum(axis=2)
             seen = seen + weight.reshape(()) * jnp.sum(product(rows, capture) * columns, axis=axes)
             light = light + jnp.sum(weight * flat * flat, axis=axes)

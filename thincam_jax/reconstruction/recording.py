@@ -32,7 +32,7 @@ from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_rat
 from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.planes import warn_of_equal_planes
-from thincam_jax.reconstruction.problem import InverseProblem, as_real, detector_shape
+from thincam_jax.reconstruction.problem import Background, InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.synthesis import (
@@ -42,6 +42,9 @@ from thincam_jax.reconstruction.synthesis import (
     synthesis_matrix,
     with_channel,
 )
+
+# Part of a capture's pixels that may be negative by noise alone.
+_DARKEST = 0.01
 
 
 class Recording(Module):
@@ -60,8 +63,8 @@ class Recording(Module):
     - `background`: known light that is not the scene's, such as a black level or a dark frame: one
       for all captures, or one for each, that broadcasts to them. By default it is unknown behind
       `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
-      (but by `Wiener`, `FringeScanning` and `PoissonTV`), at no cost where there is none. 0 with
-      operators.
+      (but by `Wiener`, `FringeScanning` and `PoissonTV`), at no cost where there is none. It is
+      negative only in captures that are partly so. 0 with operators.
 
     **Errors**: ValueError, one line, for captures that do not fit the imaging model.
 
@@ -149,7 +152,7 @@ class Recording(Module):
             "tau": tau,
             "regulariser": regulariser,
             "nonnegative": nonnegative,
-            "free_background": self._background_is_free(),
+            "background": self._kind_of_background(synthesis),
         }
         operators = self._operators()
         if operators:
@@ -291,8 +294,15 @@ class Recording(Module):
             )
         return tuple(each)
 
-    def _background_is_free(self) -> bool:
-        return self.background is None and not isinstance(self.imaging_model, Stacked)
+    def _kind_of_background(self, synthesis: Any) -> Background:
+        """Not negative but in differences of captures, and if something was subtracted before."""
+        if self.background is not None or isinstance(self.imaging_model, Stacked):
+            return "known"
+        captures, _ = self._masked_captures()
+        light = [c for c in captures if not checks.is_traced(c)]
+        below = any(np.quantile(np.asarray(c), _DARKEST) < 0 for c in light)
+        mixed = synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))
+        return "unknown" if below or mixed else "nonnegative"
 
     @property
     def light(self) -> tuple[Float[Array, "..."], ...]:

@@ -28,7 +28,7 @@ POWER_ITERATIONS = 40
 class WeightedOperator(AbstractOperator):
     r"""Weighted operators of a problem and its batch, :math:`f \mapsto (\sqrt{w_k}\, A_k f)_k`.
 
-    A_k f is less its weighted mean where the background is free.
+    A_k f is less its weighted mean where there is a background to find.
     """
 
     problem: InverseProblem
@@ -119,7 +119,7 @@ def _norm(problem: InverseProblem, iterations: int) -> Float[Array, ""]:
     """‖√w A‖ with a margin, by the power method, at most the bound of the spectra."""
     dtype = problem.captures[0].dtype
     (first, *others), (weight, *_) = problem.operators, problem.weights
-    alone = not others and weight.size == 1 and not problem.free_background
+    alone = not others and weight.size == 1 and not problem.has_background
     if alone:  # the operator may know its own norm
         found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=iterations, dtype=dtype)
     else:

@@ -44,11 +44,12 @@ from thincam_jax.reconstruction.admm import (
 )
 from thincam_jax.reconstruction.normal_equations import AbstractNormal, normal_equations
 from thincam_jax.reconstruction.problem import (
+    Background,
     InverseProblem,
     back_projected,
     convolutions,
     or_one,
-    weighted_mean,
+    with_background,
 )
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
@@ -91,7 +92,7 @@ class FourierSplitting(AbstractSplitting):
     captures: tuple[Float[Array, "*batch channel y x"], ...]
     weights: tuple[Float[Array, "..."], ...]
     normal: "NormalInverse"
-    free_background: bool = eqx.field(static=True)
+    background: Background = eqx.field(static=True)
 
     def __init__(
         self,
@@ -104,7 +105,7 @@ class FourierSplitting(AbstractSplitting):
         self.operators = operators
         self.gains, self.captures, self.weights, self.tau, self.normal, self.image_unit = units
         self.variation, self.nonnegative = variation, problem.nonnegative
-        self.free_background = problem.free_background
+        self.background = problem.background
         self.penalties = _default_penalties(self.operators, self.gains)
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
@@ -150,14 +151,13 @@ class FourierSplitting(AbstractSplitting):
         return self._images(self.normal(total, penalties))
 
     def _data_pull(self, operator: CropConvolution, capture, weight, q):
-        """z − q of a capture: zero outside of the sensor; z is best with its background, if free.
+        """z − q of a capture: zero outside of the sensor; z is best with its background.
 
         The minimum over z has the weights of `share` for the background.
         """
         seen = cut(q, operator.sensor_corner, operator.sensor_shape)
         share, missing = weight / (weight + self.penalties.data), capture - seen
-        if self.free_background:
-            missing = missing - weighted_mean(share, missing, 2)
+        missing = -with_background(self.background, share, -missing, 2)
         return place(share * missing, operator.sensor_corner, operator.window)
 
     def _images(self, spectrum) -> State:
