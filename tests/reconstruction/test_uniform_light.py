@@ -13,13 +13,13 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
-from thincam_jax.reconstruction import methods
-from thincam_jax.reconstruction.methods import (
+from thincam_jax.reconstruction import methods, uniform_light
+from thincam_jax.reconstruction.problem import objective, residuals
+from thincam_jax.reconstruction.uniform_light import (
     full_windows,
     with_uniform_light,
     without_uniform_light,
 )
-from thincam_jax.reconstruction.problem import objective, residuals
 from thincam_jax.units import um
 
 SENSOR, FIELD, LENGTH = (48, 61), (40, 45), 7
@@ -31,7 +31,7 @@ WIDE = (192, 224)  # pixels of a camera that is biased: an aperture of 224
 @pytest.fixture
 def low_bar(monkeypatch):
     """Small cameras are biased, too."""
-    monkeypatch.setattr(methods, "_BIASED", 5.0)
+    monkeypatch.setattr(uniform_light, "_BIASED", 5.0)
 
 
 def kernels(channels=1, planes=1, phase=0.0):
@@ -152,7 +152,7 @@ def test_whole_windows_against_a_loop(length):
 def test_cameras_without_bias_are_left_alone(monkeypatch):
     """Fringes alone, and a small aperture."""
     assert without_uniform_light(noisy_problem(kernels())) is None  # 24 pixels
-    monkeypatch.setattr(methods, "_BIASED", 5.0)
+    monkeypatch.setattr(uniform_light, "_BIASED", 5.0)
     assert without_uniform_light(noisy_problem(fringes())) is None
     assert without_uniform_light(noisy_problem(kernels())) is not None
 

@@ -12,9 +12,13 @@ from thincam_jax._core.checks import is_traced
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, plane_mean
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one
+from thincam_jax.reconstruction.uniform_light import high_passed, window_length
 
 # Correlation of two planes' PSFs: they differ by 0.5 to 1 pixel at the edge.
 _ALIKE = 0.95
+# Smooth misfit of measured PSFs relative to the light: shading, a pedestal, stray light. Where as
+# much is `_HIDDEN` times the noise or more, noise hides it, and low frequencies count in full.
+_SMOOTH, _HIDDEN = 0.03, 0.2
 _FINEST = 0.25  # cycles/pixel; above it are the noise of measured PSFs and little light
 
 
@@ -42,6 +46,29 @@ def with_equal_planes(
     unit = or_one(jnp.sqrt(total / or_one(jnp.mean(total))))[:, None, None]
     spectra = [o.spectrum / unit.astype(o.spectrum.dtype) for o in operators]
     return eqx.tree_at(lambda p: [o.spectrum for o in p.operators], problem, spectra), unit
+
+
+def without_smooth_misfit(problem: InverseProblem) -> InverseProblem:
+    r"""A problem of several planes in which low frequencies weigh as much as they can be trusted.
+
+    Planes differ in the fine detail of their PSFs, and captures have most of their light at low
+    frequencies. A PSF that is wrong there by a part ε (a pedestal, shading, stray light) has light
+    explained by the plane whose shadow has the size wanted, mostly the farthest, whatever the
+    detail says. The high-pass δ − (1 − η) w of captures and PSFs, as of `without_uniform_light`,
+    keeps of the frequencies that a Hann window w of n pixels passes as much as makes this misfit
+    as strong as the noise,
+
+    .. math:: \eta = \frac{\sigma\,\|w\|}{\epsilon\,\mathrm{rms}(g)},\qquad
+        \|w\| = \frac{1.5}{n + 1},\quad \epsilon = 0.03,
+
+    and hundreds of iterations become some 50. A capture with more noise (η > 0.2) stays as it is.
+    """
+    window, kept = 1.5 / (window_length(problem) + 1), []
+    for weight, capture in zip(problem.weights, problem.captures, strict=True):
+        light = jnp.mean(jnp.where(weight > 0, capture, 0) ** 2)
+        kept.append(window / (_SMOOTH * float(jnp.sqrt(or_one(jnp.max(weight) * light)))))
+    filtered = high_passed(problem, [k if k < _HIDDEN else 1.0 for k in kept])
+    return problem if filtered is None else filtered
 
 
 def warn_of_equal_planes(operators: list[CropConvolution], weights: Sequence[Any]) -> None:

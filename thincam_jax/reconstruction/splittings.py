@@ -195,13 +195,16 @@ def _default_penalties(operators, gains) -> Penalties:
     If one low frequency is far stronger than the others, as with a bright background, the splits
     of variation and image weigh more by the ratio of the largest to the root mean square,
     μ₂ = μ₃ = max|H|/rms|H|. μ₁ = 1 weighs the split data like the data. A rule of thumb, which
-    residual balancing corrects.
+    residual balancing corrects. Several planes are separated by frequencies in which their PSFs
+    differ, a tenth as strong or less: μ₁ = 0.1, and μ₂ = μ₃ a hundredth of the above.
     """
     power = sum(
         g**2 * jnp.sum(squared_modulus(o.spectrum), axis=-3)
         for o, g in zip(operators, gains, strict=True)
     )
     strongest = jax.lax.stop_gradient(or_one(jnp.sqrt(jnp.max(power))))
+    if operators[0].spectrum.shape[-3] > 1:
+        return Penalties(jnp.full_like(strongest, 0.1), strongest / 100, strongest / 100)
     return Penalties(jnp.ones_like(strongest), strongest, strongest)
 
 
