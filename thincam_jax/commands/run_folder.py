@@ -14,7 +14,7 @@ import pydantic
 from filelock import FileLock, Timeout
 
 from thincam_jax._core.environment import environment, installed
-from thincam_jax._core.files import WriteError, read_regular, write_whole
+from thincam_jax._core.files import WriteError, file_digest, read_json, read_regular, write_whole
 from thincam_jax._core.precision import is_double
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
@@ -85,7 +85,7 @@ class RunFolder:
 
     def changed(self, config: Section) -> list[str]:
         """Inputs that are others than those of the results that the folder holds."""
-        was, now = read_json(self.path / _ORIGIN) or {}, origin_of(config)
+        was, now = read_entries(self.path / _ORIGIN), origin_of(config)
         return [name for name in sorted({*was, *now}) if was.get(name) != now.get(name)]
 
     def make(self, config: Section) -> None:
@@ -136,8 +136,8 @@ class RunFolder:
 
     def finished(self, target: str) -> dict[str, Any] | None:
         """The stored results of a target; None if it has not been finished or is damaged."""
-        held = read_json(self.path / "targets" / f"{slug(target)}.json")
-        return held if held and held.pop(_SUM, None) == digest(to_json(held)) else None
+        held = read_entries(self.path / "targets" / f"{slug(target)}.json")
+        return held if held.pop(_SUM, None) == digest(to_json(held)) else None
 
     def finish(self, target: str, results: dict[str, Any]) -> None:
         """Store the results of a target, with their sum."""
@@ -200,25 +200,21 @@ def to_json(data: Any) -> str:
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """Entries that `to_json` wrote; None of a file with anything else, and where there is none."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        held = json.loads(read_regular(path))
-        to_json(held).encode("utf-8")
-        return held if isinstance(held, dict) else None
+def read_entries(path: Path) -> dict[str, Any]:
+    """Entries that `to_json` wrote; none of a file with anything else, or that is not there."""
+    with contextlib.suppress(OSError, ValueError):
+        held = read_json(path)
+        return dict(held) if isinstance(held, dict) and to_json(held).encode("utf-8") else {}
+    return {}
 
 
 def origin_of(config: pydantic.BaseModel) -> dict[str, str]:
-    """Inputs of a run beside its configuration.
-
-    By the path of each file that it names and of those in folders, SHA-256; the version of the
-    package; the precision.
-    """
+    """Package, precision, and SHA-256 of each file and of those in folders that a file names."""
     found = installed(("thincam_jax",)) | {"precision": "float64" if is_double() else "float32"}
     for name in _named(config.model_dump(mode="json")):
-        for path in filter(Path.is_file, name.iterdir() if name.is_dir() else (name,)):
-            with contextlib.suppress(OSError), open(path, "rb") as file:
-                found[str(path)] = hashlib.file_digest(file, "sha256").hexdigest()
+        for path in name.iterdir() if name.is_dir() else (name,):
+            with contextlib.suppress(OSError):
+                found[str(path)] = file_digest(path)
     return found
 
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from pyarrow import csv
 
 from thincam_jax._core.files import write_whole
-from thincam_jax.commands.run_folder import RunFolder, read_json
+from thincam_jax.commands.run_folder import RunFolder, read_entries
 from thincam_jax.commands.sweep.point import GridPoint, Outcome, described, measure_point, one_line
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 
@@ -57,7 +57,7 @@ class SweepFolder(RunFolder):
             row = read_row(self._row(point))
             if row is not None:
                 rows.append((point.values, row))
-            elif failure := read_json(self._failure(point)):
+            elif failure := read_entries(self._failure(point)):
                 failures.append(failure)
         found = joined(rows) if rows else None
         for name, content in (

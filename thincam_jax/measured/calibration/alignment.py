@@ -22,7 +22,7 @@ import skimage
 from jaxtyping import Float, UInt8
 from skimage.transform import ProjectiveTransform, SimilarityTransform
 
-from thincam_jax._core.files import MeasurementError, read_regular, write_whole
+from thincam_jax._core.files import MeasurementError, read_json, write_whole
 from thincam_jax._core.grids import block_mean
 
 MapKind = Literal["similarity", "homography"]
@@ -141,7 +141,7 @@ class Alignment:
     def read(cls, path: str | PathLike[str]) -> "Alignment":
         """Read such a file; ValueError, one line, for another one."""
         try:
-            given = json.loads(read_regular(path))
+            given = read_json(path)
             arrays = {name: np.array(given[name], float) for name in ("unknowns", "covariance")}
             found = cls(**given | arrays | {"shape": tuple(given["shape"])})
             found.summary()
