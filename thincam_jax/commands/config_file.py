@@ -11,6 +11,7 @@ from thincam_jax._core.files import TooLargeError, read_regular
 from thincam_jax._core.text import shortened
 
 _MOST_ENTRIES = 100_000
+_LONGEST_NUMBER = 200  # characters; of larger numbers, Python makes none, or no text
 _MOST_BYTES = 2**17  # which the parser takes a second for
 
 
@@ -104,6 +105,9 @@ def _read_yaml(text: str) -> tuple[yaml.Node | None, Any]:
 
 def _entries(node: yaml.Node, known: dict[int, int]) -> int:
     """Entries of a node with those of all below it; each node is visited once."""
+    if node.tag[-4:] in (":int", "loat") and len(node.value) > _LONGEST_NUMBER:
+        where, most = f"line {node.start_mark.line + 1}", f"at most {_LONGEST_NUMBER}"
+        raise TooLargeError(f"{where} has a number of {len(node.value)} characters; give {most}")
     if id(node) not in known and isinstance(node, yaml.CollectionNode):
         inner = (
             n for entry in node.value for n in (entry if isinstance(entry, tuple) else (entry,))

@@ -14,6 +14,7 @@ def main() -> None:
     """Run the command `thincam`."""
     end_on_interrupt()
     os.environ["MPLBACKEND"] = "agg"  # figures are files
+    os.environ.pop("JAX_NUMPY_RANK_PROMOTION", None)  # is for scripts; no array here is theirs
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Each line at once, so that a full disk is reported; escaped what the encoding lacks.
         sys.stdout.reconfigure(errors="backslashreplace", line_buffering=True)
