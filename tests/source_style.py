@@ -54,6 +54,28 @@ def tables_of_units(modules: list[Module]) -> list[str]:
     ]
 
 
+# All that an assertion may be made of: it is for the type checker, and `python -O` leaves it out.
+_ASSERTED = (ast.BoolOp, ast.boolop, ast.Compare, ast.cmpop, ast.Attribute, ast.Name, ast.Load)
+
+
+def asserted_work(modules: list[Module]) -> list[str]:
+    """An assertion looks at what is there: no assignment and no call but isinstance."""
+
+    def works(node: ast.AST) -> bool:
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "isinstance":
+            return any(map(works, node.args))
+        if isinstance(node, ast.Constant | ast.Tuple):
+            return any(map(works, ast.iter_child_nodes(node)))
+        return not isinstance(node, _ASSERTED) or any(map(works, ast.iter_child_nodes(node)))
+
+    return [
+        f"{module.path}:{node.lineno}: an assertion that does more than look: put it before"
+        for module in modules
+        for node in module.nodes
+        if isinstance(node, ast.Assert) and works(node.test)
+    ]
+
+
 def named_tuples(modules: list[Module]) -> list[str]:
     """A record is a module or a frozen dataclass; a tuple could be unpacked, indexed and added."""
     return [
@@ -195,6 +217,7 @@ def vague_words(modules: list[Module]) -> list[str]:
 
 
 STYLE_RULES = (
+    asserted_work,
     bare_files,
     tables_of_units,
     named_tuples,
@@ -209,6 +232,9 @@ STYLE_RULES = (
 
 # rule, file, source, part of the complaint
 BROKEN_STYLE = [
+    (asserted_work, "design/a.py", "assert (a := 1)", "a.py:1: an assertion that"),
+    (asserted_work, "design/a.py", "assert isinstance(a := 1, int)", "does more than look"),
+    (asserted_work, "design/a.py", "assert a.b is not None and a.pop()", "put it before"),
     (vague_words, "design/a.py", "told = 'alike: cannot be told apart'", "reported, given"),
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),

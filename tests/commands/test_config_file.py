@@ -5,7 +5,7 @@ import re
 import pytest
 from commands.study.test_config import BASE, changed, faults, line_of, load
 
-from thincam_jax.commands.config_file import ConfigError, read_value
+from thincam_jax.commands.config_file import ConfigError, override, read_raw, read_value
 from thincam_jax.commands.kinds import load_experiment
 
 
@@ -66,6 +66,20 @@ class TestYaml:
         monkeypatch.setattr("thincam_jax.commands.config_file._MOST_ENTRIES", 3)
         with pytest.raises(ConfigError, match="^--set a: holds 4 entries .* at most 3 are read"):
             read_value("[1, 2, 3]", "--set a")
+
+    @pytest.mark.parametrize(
+        "number", ["0x" + "f" * 5000, "9" * 5000, "0b" + "1" * 20_000, "1:" * 3000 + "1"]
+    )
+    def test_numbers_of_thousands_of_digits(self, tmp_path, number):
+        for given in (number, "1:" * 3000 + "1.5"):  # which no float holds
+            path = tmp_path / "a.yaml"
+            path.write_text(f"name: a\nseed: {given}\n")
+            with pytest.raises(ConfigError) as caught:
+                read_raw(path)
+            fault = f"line 2 has a number of {len(given)} characters; give at most 200"
+            assert str(caught.value) == f"{path}: {fault}"
+            with pytest.raises(ConfigError, match="^--set seed=.*: line 1 has a number of"):
+                override({}, f"seed={given}")
 
     def test_unit_without_a_space(self, tmp_path):
         config = load(tmp_path, changed("pitch: 40 um", "pitch: 40um"))

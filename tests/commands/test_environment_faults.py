@@ -188,6 +188,9 @@ def test_two_at_once_on_one_cache(tmp_path):
     assert others == [first, first]
 
 
+GUARDED = {"JAX_TRANSFER_GUARD": "disallow", "JAX_NUMPY_RANK_PROMOTION": "raise"}
+
+
 @pytest.mark.parametrize(
     ("words", "prepare", "settings", "code", "text"),
     [
@@ -195,6 +198,7 @@ def test_two_at_once_on_one_cache(tmp_path):
         (["schema", "study"], "", ASCII, 0, "fill_factor \\u2264 1"),
         (["doctor"], "", {"MPLBACKEND": "banana"}, 0, "devices: cpu:0"),
         (["doctor"], "", NO_GPU, 2, "JAX cannot start with JAX_PLATFORMS=cuda"),
+        (["doctor"], "", GUARDED, 2, "JAX_TRANSFER_GUARD=disallow forbids arrays of files; unset"),
         (["doctor"], NO_PRINT, {}, 2, "No space left on device"),
         (["--version"], NO_PRINT, {}, 2, "No space left on device"),
         (["schema", "study"], NO_PRINT, {}, 2, "No space left on device"),

@@ -30,6 +30,19 @@ class _Kind:
 _Kinds = tuple[_Kind, ...]
 
 
+def any_rank(function: _Public) -> _Public:
+    """The function, where JAX's option `jax_numpy_rank_promotion` is for other arrays alone."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if jax.config.jax_numpy_rank_promotion == "allow":  # pyright: ignore
+            return function(*args, **kwargs)
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return typing.cast(_Public, call)
+
+
 def checked(public: _Public) -> _Public:
     """The function or class, which raises TypeError in one line for an argument of another kind.
 
@@ -46,6 +59,7 @@ def checked(public: _Public) -> _Public:
     # A quantity tells one number of another kind itself.
     kinds = {name: kind for name, kind in kinds.items() if name not in ranges or ranges[name].many}
 
+    @any_rank
     @functools.wraps(public)
     def call(*args: Any, **kwargs: Any) -> Any:
         for name, value in (*zip(names, args, strict=False), *kwargs.items()):

@@ -2,12 +2,15 @@
 
 import contextlib
 import errno
+import hashlib
 import io
+import json
 import os
 import stat
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +19,10 @@ from thincam_jax._core.memory import refuse_if_too_large
 
 class MeasurementError(ValueError):
     """A measurement that cannot be used; one line says what was given and what to do."""
+
+
+class TooLargeError(ValueError):
+    """A file or a document that is larger than is read; one line without its name."""
 
 
 class WriteError(OSError):
@@ -65,31 +72,56 @@ def write_whole(
     return path
 
 
-def read_regular(path: str | os.PathLike[str]) -> bytes:
-    """All bytes of a regular file, as many as it is known to hold before.
-
-    **Errors**: OSError for a device, a pipe or what cannot be opened; MemoryError, one line, where
-    it does not fit.
-    """
+@contextlib.contextmanager
+def open_regular(path: str | os.PathLike[str]) -> Iterator[tuple[io.BufferedReader, int]]:
+    """A regular file, open, and its size in bytes; OSError for a device, a pipe or another."""
     # Without waiting for the other end, should it be a pipe.
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "a device or a pipe, no regular file", str(path))
-        if status.st_size > _SMALL:
-            refuse_if_too_large(str(path), status.st_size, "give a smaller file")
-        return file.read(status.st_size)
+        yield file, status.st_size
+
+
+def read_regular(path: str | os.PathLike[str], most: int | None = None) -> bytes:
+    """All bytes of a regular file, as many as it is known to hold before.
+
+    **Errors**: OSError for a device, a pipe or what cannot be opened; TooLargeError for more bytes
+    than `most`; MemoryError, one line, where it does not fit.
+    """
+    with open_regular(path) as (file, size):
+        if most is not None and size > most:
+            raise TooLargeError(f"holds {size} bytes, at most {most} are read; give a smaller file")
+        if size > _SMALL:
+            refuse_if_too_large(str(path), size, "give a smaller file")
+        return file.read(size)
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a regular file, in parts; OSError as of `open_regular`."""
+    with open_regular(path) as (file, _):
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Content of a JSON file. **Errors**: OSError; ValueError for another file."""
+    try:
+        return json.loads(read_regular(path, _MOST_JSON))
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Arrays of an .npz file as `numpy.savez` writes it; errors of many kinds for others."""
-    content = io.BytesIO(read_regular(path))
-    if any(entry.compress_type for entry in zipfile.ZipFile(content).infolist()):
-        raise ValueError("its arrays are packed")
-    with np.load(content, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    with open_regular(path) as (content, size):
+        if any(entry.compress_type for entry in zipfile.ZipFile(content).infolist()):
+            raise ValueError("its arrays are packed")
+        refuse_if_too_large(str(path), size, "give a smaller file")
+        with np.load(content, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
 
 
+_MOST_JSON = 2**24  # bytes
 _SMALL = 2**20  # bytes that are read without asking for the memory
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _ADVICE = dict.fromkeys(_FULL, "make room or give another folder")

@@ -5,6 +5,11 @@ import os
 
 def cannot_start() -> str:
     """The fault of variables with which JAX cannot start, in a line; empty where it can."""
+    for name in ("", "_HOST_TO_DEVICE", "_DEVICE_TO_HOST", "_DEVICE_TO_DEVICE"):
+        if (given := os.environ.get(f"JAX_TRANSFER_GUARD{name}", "")).startswith("disallow"):
+            return (
+                f"JAX_TRANSFER_GUARD{name}={given} forbids to read a file into an array; unset it"
+            )
     names = ("JAX_PLATFORMS", "JAX_ENABLE_X64")
     settings = " ".join(f"{name}={os.environ[name]}" for name in names if name in os.environ)
     if not settings:

@@ -1,6 +1,7 @@
 """Modules that print the values of their numbers, with units."""
 
 import dataclasses
+import inspect
 from typing import Any
 
 import equinox as eqx
@@ -9,13 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import wadler_lindig as wl
 
+from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.quantity import Quantity, unchecked
 
 _MOST = 4  # numbers of an array that are shown, not counted
 _PLAIN = unchecked()
 
 
-class Module(eqx.Module):
+class AnyRank(eqx.Module):
+    """Modules whose methods add up arrays of any ranks, whatever JAX's option says."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for name, one in list(vars(cls).items()):
+            if inspect.isfunction(one) and (name == "__call__" or not name.startswith("_")):
+                setattr(cls, name, any_rank(one))
+
+
+class Module(AnyRank):
     """An `equinox.Module` whose repr shows scalars by value and unit; "?" while they are traced.
 
     Larger arrays are shown by type and shape. None is left out, and so is what is as by default,

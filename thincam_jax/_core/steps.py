@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from thincam_jax._core.arguments import any_rank
+
 # Called as a step begins, with its text and with the number of all steps.
 Progress = Callable[[str, int], object]
 
@@ -15,6 +17,7 @@ class Step:
     do: Callable[[], object]
 
 
+@any_rank
 def carry_out(work: Sequence[Step], progress: Progress | None = None) -> None:
     """Do the steps in their order."""
     for step in work:

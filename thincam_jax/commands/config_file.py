@@ -7,10 +7,12 @@ from typing import Any
 
 import yaml
 
-from thincam_jax._core.files import read_regular
+from thincam_jax._core.files import TooLargeError, read_regular
 from thincam_jax._core.text import shortened
 
 _MOST_ENTRIES = 100_000
+_LONGEST_NUMBER = 200  # characters; of larger numbers, Python makes none, or no text
+_MOST_BYTES = 2**17  # which the parser takes a second for
 
 
 class ConfigError(ValueError):
@@ -61,7 +63,7 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
         what = "a folder" if path.is_dir() else "missing"
         raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
     try:
-        node, raw = _read_yaml(read_regular(path).decode("utf-8"))
+        node, raw = _read_yaml(read_regular(path, _MOST_BYTES).decode("utf-8"))
         twice: set[tuple[int, str]] = set()  # an aliased part is reported once
         places = {location: f"{path}:{line}" for location, line in _lines(node, twice)}
     except UnicodeDecodeError as error:
@@ -71,7 +73,7 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
         line = f":{mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "not YAML"
         raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
-    except _TooLargeError as error:
+    except TooLargeError as error:
         raise ConfigError(f"{path}: {error}") from None
     except ValueError as error:  # such as a date that does not exist
         raise ConfigError(f"{path}: not valid YAML: {error}; put texts in quotes") from None
@@ -80,10 +82,6 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
     if twice:
         raise ConfigError("\n".join(f"{path}:{line}: {fault}" for line, fault in sorted(twice)))
     return raw, places
-
-
-class _TooLargeError(ValueError):
-    """A document that is not to be built."""
 
 
 def _read_yaml(text: str) -> tuple[yaml.Node | None, Any]:
@@ -96,17 +94,20 @@ def _read_yaml(text: str) -> tuple[yaml.Node | None, Any]:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
         count = 0 if node is None else _entries(node, {})
         if count > _MOST_ENTRIES:
-            raise _TooLargeError(
+            raise TooLargeError(
                 f"holds {count} entries (an alias counts as all that it stands for), at most "
                 f"{_MOST_ENTRIES} are read; give fewer"
             )
         return node, yaml.safe_load(text)
     except RecursionError:
-        raise _TooLargeError("nested too deeply, or an alias inside its anchor") from None
+        raise TooLargeError("nested too deeply, or an alias inside its anchor") from None
 
 
 def _entries(node: yaml.Node, known: dict[int, int]) -> int:
     """Entries of a node with those of all below it; each node is visited once."""
+    if node.tag[-4:] in (":int", "loat") and len(node.value) > _LONGEST_NUMBER:
+        where, most = f"line {node.start_mark.line + 1}", f"at most {_LONGEST_NUMBER}"
+        raise TooLargeError(f"{where} has a number of {len(node.value)} characters; give {most}")
     if id(node) not in known and isinstance(node, yaml.CollectionNode):
         inner = (
             n for entry in node.value for n in (entry if isinstance(entry, tuple) else (entry,))
@@ -178,7 +179,7 @@ def read_value(text: str, asked: str) -> Any:
     """A value as YAML has it; `asked` is how the user asked for it, for the message."""
     try:
         return _read_yaml(text)[1]
-    except _TooLargeError as error:
+    except TooLargeError as error:
         raise ConfigError(f"{asked}: {error}") from None
     except (yaml.YAMLError, ValueError):
         given = shortened(repr(text))

@@ -140,7 +140,7 @@ def train(
         kind = kind_of(asked)
         folder = TrainingFolder.chosen(out, asked.name, asked)
         if dry_run:
-            InFolder(folder, lambda _: None, resume).check()
+            InFolder(folder, lambda _: None, resume).check(asked)
             kind.part(kind.build)(asked)
             explain.dry_run(asked, folder.outcome(asked))
             return

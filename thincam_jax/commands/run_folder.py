@@ -1,8 +1,10 @@
 """A run: the list of its work, its folder, and how an interrupted one goes on."""
 
+import contextlib
+import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -11,8 +13,9 @@ import numpy as np
 import pydantic
 from filelock import FileLock, Timeout
 
-from thincam_jax._core.environment import environment
-from thincam_jax._core.files import WriteError, read_regular, write_whole
+from thincam_jax._core.environment import environment, installed
+from thincam_jax._core.files import WriteError, file_digest, read_json, read_regular, write_whole
+from thincam_jax._core.precision import is_double
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
@@ -27,13 +30,14 @@ if TYPE_CHECKING:
 
 Running = TypeVar("Running", bound="Run")
 Folder = TypeVar("Folder", bound="RunFolder")
-_LOCK = ".lock"
+_LOCK, _ORIGIN, _SUM = ".lock", "inputs.json", "sha256"
+FILE_KEYS = ("path", "start")  # of experiment files, that name a file or a folder of files
 
 
 class RunFolder:
     """Files of one run. Every file is written whole or not at all.
 
-    - `config.yaml`: the resolved configuration.
+    - `config.yaml`: the resolved configuration. `inputs.json`: see `origin_of`.
     - `targets/NAME.json`: the metrics of a finished target; an interrupted study skips these.
     - `images/`: reconstructions and scenes, `figures/`: the report's pictures.
     - `environment.json`, `report.html` and, last, the `result`: written at the end.
@@ -68,12 +72,21 @@ class RunFolder:
         return True
 
     def claim(self, config: Section) -> None:
-        """Make the folder; an interrupted run goes on, a complete one is done anew."""
+        """Make the folder; an interrupted run goes on, a complete one is done anew.
+
+        So is one of other inputs: files that the configuration names, the package, the precision.
+        """
         self.make(config)
-        if (self.path / self.result).exists():
+        if (self.path / self.result).exists() or self.changed(config):
             for finished in (self.path / "targets").glob("*.json"):
                 finished.unlink()
-            (self.path / self.result).unlink()
+            (self.path / self.result).unlink(missing_ok=True)
+        self.write(_ORIGIN, to_json(origin_of(config)))
+
+    def changed(self, config: Section) -> list[str]:
+        """Inputs that are others than those of the results that the folder holds."""
+        was, now = read_entries(self.path / _ORIGIN), origin_of(config)
+        return [name for name in sorted({*was, *now}) if was.get(name) != now.get(name)]
 
     def make(self, config: Section) -> None:
         """Make the folder and write the configuration; one of the same is taken as it is.
@@ -122,15 +135,14 @@ class RunFolder:
             raise ConfigError(f"--out {self.path}: {message}")
 
     def finished(self, target: str) -> dict[str, Any] | None:
-        """The stored results of a target, or None if it has not been finished."""
-        path = self.path / "targets" / f"{slug(target)}.json"
-        try:
-            return json.loads(read_regular(path))
-        except (OSError, json.JSONDecodeError):
-            return None
+        """The stored results of a target; None if it has not been finished or is damaged."""
+        held = read_entries(self.path / "targets" / f"{slug(target)}.json")
+        return held if held.pop(_SUM, None) == digest(to_json(held)) else None
 
     def finish(self, target: str, results: dict[str, Any]) -> None:
-        self.write(f"targets/{slug(target)}.json", to_json(results))
+        """Store the results of a target, with their sum."""
+        summed = {**results, _SUM: digest(to_json(results))}
+        self.write(f"targets/{slug(target)}.json", to_json(summed))
 
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file of the folder, whole or not at all."""
@@ -186,6 +198,38 @@ class Run:
 
 def to_json(data: Any) -> str:
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """Entries that `to_json` wrote; none of a file with anything else, or that is not there."""
+    with contextlib.suppress(OSError, ValueError):
+        held = read_json(path)
+        return dict(held) if isinstance(held, dict) and to_json(held).encode("utf-8") else {}
+    return {}
+
+
+def origin_of(config: pydantic.BaseModel) -> dict[str, str]:
+    """Package, precision, and SHA-256 of each file and of those in folders that a file names."""
+    found = installed(("thincam_jax",)) | {"precision": "float64" if is_double() else "float32"}
+    for name in _named(config.model_dump(mode="json")):
+        for path in name.iterdir() if name.is_dir() else (name,):
+            with contextlib.suppress(OSError):
+                found[str(path)] = file_digest(path)
+    return found
+
+
+def _named(data: Any, key: str = "") -> Iterator[Path]:
+    """Files and folders that are named below an entry."""
+    if key in FILE_KEYS and isinstance(data, str):
+        yield Path(data)
+    elif isinstance(data, list | dict):
+        for name, value in data.items() if isinstance(data, dict) else (("", one) for one in data):
+            yield from _named(value, name)
+
+
+def digest(text: str) -> str:
+    """SHA-256 of a text."""
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
 
 
 def as_record(kind: Any, data: Any) -> Any:

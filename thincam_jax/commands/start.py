@@ -17,6 +17,7 @@ def main() -> None:
         pass  # a stream that was closed at the start: its number is no file's to come
     os.close(unused)
     os.environ["MPLBACKEND"] = "agg"  # figures are files
+    os.environ.pop("JAX_NUMPY_RANK_PROMOTION", None)  # is for scripts; no array here is theirs
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Each line at once, so that a full disk is reported; escaped what the encoding lacks.
         sys.stdout.reconfigure(errors="backslashreplace", line_buffering=True)

@@ -1,6 +1,5 @@
 r"""Files of phase masks: 8-bit height maps with their scale, and solids for writing them."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from jaxtyping import Float32, Float64
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax._core.files import MeasurementError, read_regular, write_whole
+from thincam_jax._core.files import MeasurementError, read_json, write_whole
 from thincam_jax.imaging.display import png_bytes
 from thincam_jax.imaging.refractive_index import (
     AbstractIndex,
@@ -211,7 +210,7 @@ def _record(path: Path) -> dict[str, Any]:
             "counts mean"
         )
     try:
-        record = json.loads(read_regular(path))
+        record = read_json(path)
         known = record["format"] == _FORMAT and len(record["shape"]) == 2
     except (OSError, ValueError, KeyError, TypeError):
         record, known = {}, False

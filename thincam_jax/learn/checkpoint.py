@@ -128,10 +128,24 @@ def _sum(data: bytes | memoryview) -> str:
 
 def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], list[memoryview]]:
     """The header, and the bytes of each array; nothing of these is interpreted yet."""
-    data = files.read_regular(path)
-    end = data.find(b"\n", 0, _LONGEST_LINE)
+    with files.open_regular(path) as (file, size):
+        line = file.readline(_LONGEST_LINE)
+        header, length = _header(path, line), size - len(line)
+        sound, contents = _is_sound(header, line[:-1], length), []
+        rest = memoryview(file.read(length) if sound else b"")
+    for _, count, digest in header["arrays"] if sound else ():
+        contents.append(rest[:count])
+        sound, rest = sound and _sum(contents[-1]) == digest, rest[count:]
+    if not sound:
+        raise CheckpointError(
+            f"{path}: is damaged or cut off; copy it again or go back to an earlier one"
+        )
+    return header, contents
+
+
+def _header(path: str | os.PathLike[str], line: bytes) -> dict[str, Any]:
     try:
-        header = json.loads(data[: max(end, 0)])
+        header = json.loads(line)
         known = header["format"] == FORMAT and type(header["version"]) is int
     except (ValueError, KeyError, TypeError, RecursionError):
         known, header = False, {}
@@ -142,16 +156,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], list[memoryview
             f"{path}: has format {header['version']} and this package reads {VERSION}; "
             "update thincam_jax"
         )
-    rest, contents = memoryview(data)[end + 1 :], []
-    sound = _is_sound(header, data[:end], len(rest))
-    for _, count, digest in header["arrays"] if sound else ():
-        contents.append(rest[:count])
-        sound, rest = sound and _sum(contents[-1]) == digest, rest[count:]
-    if not sound:
-        raise CheckpointError(
-            f"{path}: is damaged or cut off; copy it again or go back to an earlier one"
-        )
-    return header, contents
+    return header
 
 
 def _is_sound(header: dict[str, Any], line: bytes, length: int) -> bool:

@@ -5,7 +5,6 @@ import io
 import logging
 import os
 import re
-import struct
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -18,25 +17,19 @@ import tifffile
 from jaxtyping import Bool
 
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.files import read_regular
-from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax._core.image_files import (
+    ImageFileError,
+    kind_of,
+    npy_header,
+    png_header,
+    read_whole,
+    tiff_pages,
+)
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
 # Raw files of cameras, most of which are TIFF with previews of their own.
 RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
 SUFFIXES = (".tif", ".tiff", ".png", ".npy", *RAW_SUFFIXES)
-_STARTS = {
-    b"\x89PNG\r\n\x1a\n": "png",
-    b"\x93NUMPY": "npy",
-    b"\xff\xd8\xff": "jpeg",
-    b"II*\0": "tiff",
-    b"MM\0*": "tiff",
-    b"II+\0": "tiff",  # BigTIFF: more than 4 GB
-    b"MM\0+": "tiff",
-}
-# Largest ratio of pixel bytes to file bytes: LZW, the densest usual compression, reaches some 2500
-# for a black image. Anything beyond is a decompression bomb.
-_DENSEST = 4000
 # Photometric interpretations that hold counts: no palette, inverted scale or colour difference.
 _PLAIN = (
     tifffile.PHOTOMETRIC.MINISBLACK,
@@ -48,8 +41,6 @@ _NONLINEAR = (
     "a JPEG's counts are not in proportion to the light (gamma, tone curve, compression), so that "
     "images show rings and wrong greys; save the camera's raw frames as TIFF or PNG"
 )
-_PNG_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type
-_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 
 
 class NonlinearWarning(UserWarning):
@@ -158,13 +149,7 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
 
 def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int | None]:
     """Pixels of each image, format, and bits a sample if known; several images only of a stack."""
-    data = _bytes(path)
-    known = (kind for start, kind in _STARTS.items() if data.startswith(start))
-    kind = "raw" if path.suffix.lower() in RAW_SUFFIXES else next(known, None)
-    if kind is None:
-        short = not data or any(start.startswith(data) for start in _STARTS)
-        what = "is empty or cut short" if short else "is not an image that can be read"
-        raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG, JPEG or NPY file")
+    kind = _kind(path)
     readers = {
         "png": _read_png,
         "jpeg": _read_jpeg,
@@ -174,8 +159,8 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
     }
     try:
         with _silence():
-            images, bits = readers[kind](data)
-    except CaptureFileError as error:
+            images, bits = readers[kind](read_whole(path, kind))
+    except (CaptureFileError, ImageFileError) as error:
         raise CaptureFileError(f"{path}: {error}") from None
     except Exception as error:  # each decoder raises its own kind
         reason = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -190,60 +175,41 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
     return images, kind, bits
 
 
-def _bytes(path: Path) -> bytes:
+def _kind(path: Path) -> str:
     try:
-        return read_regular(path)
+        kind = kind_of(path)
     except FileNotFoundError:
         raise CaptureFileError(f"{path}: does not exist; give the path of an image") from None
     except IsADirectoryError:
         raise CaptureFileError(f"{path}: is a folder; give the path of one image") from None
     except OSError as error:
         raise CaptureFileError(f"{path}: cannot be read ({error.strerror or error})") from None
-
-
-def _refuse_bomb(announced: int, held: int) -> None:
-    """Refuse, before allocation, more bytes of pixels than a file can hold."""
-    if announced > _DENSEST * held:
-        raise CaptureFileError(
-            f"announces {announced} bytes of pixels, more than its {held} can hold: it is damaged"
-        )
-    refuse_if_too_large("its image", announced, "give a smaller one")
+    if kind is not None and path.suffix.lower() in RAW_SUFFIXES:
+        return "raw"
+    if not kind:
+        what = "is not an image that can be read" if kind is None else "is empty or cut short"
+        raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG, JPEG or NPY file")
+    return kind
 
 
 def _read_npy(data: bytes) -> tuple[list[np.ndarray], None]:
     stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in readers:
-        raise CaptureFileError(f"is NPY of version {version}; save it with numpy.save")
-    shape, _, dtype = readers[version](stream)
+    _, dtype = npy_header(stream)
     if dtype.hasobject or dtype.fields:
         raise CaptureFileError(f"holds {dtype} values, no image; give uint8, uint16 or float")
-    # Before NumPy allocates what a damaged header announces.
-    size, held = dtype.itemsize * np.prod([int(n) for n in shape], dtype=object), len(data)
-    if size > held - stream.tell():
-        raise CaptureFileError(
-            f"is cut short: {held - stream.tell()} of the {size} bytes of its values are there"
-        )
     stream.seek(0)
     return [np.load(stream, allow_pickle=False)], None
 
 
 def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
-    """Pixels (y, x) or (y, x, channel) and bits a sample; verifies checksums."""
-    columns, rows, depth, colour = struct.unpack_from(">IIBB", data, 16)
-    if colour not in _PNG_CHANNELS:
+    """Pixels (y, x) or (y, x, channel) and bits a sample."""
+    _, _, depth, colour, *_ = png_header(data)
+    if colour == 3:
         raise CaptureFileError("stores a palette, no counts; save it as grey or RGB")
     if depth < 8:
         raise CaptureFileError(f"has {depth} bit a sample; 8 to 16 are read")
     if b"acTL" in data[: data.find(b"IDAT")]:
         raise CaptureFileError("is animated; give one image a file")
-    if _PNG_END not in data:
-        raise CaptureFileError("is cut short: the PNG's last chunks are missing")
-    _refuse_bomb(rows * columns * _PNG_CHANNELS[colour] * depth // 8, len(data))
     if depth == 16 and colour:  # of which Pillow keeps 8 bits
         import imagecodecs
 
@@ -254,7 +220,6 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
 
 
 def _by_pillow(data: bytes) -> np.ndarray:
-    PIL.Image.open(io.BytesIO(data)).verify()  # a PNG's checksums
     with PIL.Image.open(io.BytesIO(data)) as file:
         return np.array(file)
 
@@ -282,22 +247,18 @@ def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], int | Non
     """Pixels (y, x) or (y, x, channel) of each image and bits a sample; no bits for floats."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         pages = _whole_pages(file, stack)
-        _refuse_bomb(sum(page.nbytes for page in pages), len(data))
-        images = [_read_page(page, len(data)) for page in pages]
+        images = [_read_page(page) for page in pages]
         bits = pages[0].bitspersample
     is_count = images[0].dtype.kind == "u" and isinstance(bits, int)
     return images, bits if is_count and 8 <= bits <= 16 else None
 
 
-def _read_page(page: tifffile.TiffPage, size: int) -> np.ndarray:
+def _read_page(page: tifffile.TiffPage) -> np.ndarray:
     if page.photometric not in _PLAIN:
         name = getattr(page.photometric, "name", page.photometric)
         raise CaptureFileError(f"stores colours as {name}, no counts; save it as grey or RGB")
     if page.axes not in ("YX", "YXS", "SYX"):
         raise CaptureFileError(f"has axes {page.axes}; give one image (y, x) or (y, x, channel)")
-    if page.size == 0:
-        raise CaptureFileError("is empty: its image has no pixels")
-    _check_whole(page, size)
     pixels = page.asarray()
     if page.axes == "SYX":
         pixels = np.moveaxis(pixels, 0, -1)
@@ -307,27 +268,12 @@ def _read_page(page: tifffile.TiffPage, size: int) -> np.ndarray:
 
 def _whole_pages(file: tifffile.TiffFile, stack: bool) -> list[tifffile.TiffPage]:
     """The file's images, one or those of a stack, without previews of lower resolution."""
-    pages = [page.aspage() for page in file.pages]
-    whole = [page for page in pages if not page.is_reduced] or pages[:1]
-    if not whole:
-        raise CaptureFileError("is cut short: the TIFF holds no image")
+    whole = tiff_pages(file)
     same = len({page.shape for page in whole}) == 1
     if len(whole) > 1 and not (stack and same):
         what = "" if same else " of different sizes"
         raise CaptureFileError(f"holds {len(whole)} images{what}; give one image a file")
     return whole
-
-
-def _check_whole(page: tifffile.TiffPage, size: int) -> None:
-    """Refuse strips beyond the file's end and missing ones, which would read as zeros."""
-    strips = list(zip(page.dataoffsets, page.databytecounts, strict=True))
-    if not strips or any(count == 0 or offset + count > size for offset, count in strips):
-        raise CaptureFileError("is cut short: a part of the TIFF's pixels is missing")
-    plain = page.compression == tifffile.COMPRESSION.NONE
-    if plain and isinstance(page.bitspersample, int):
-        needed = (page.size * page.bitspersample) // 8
-        if sum(count for _, count in strips) < needed:
-            raise CaptureFileError("is damaged: the TIFF has fewer pixels than it announces")
 
 
 def _without_alpha(pixels: np.ndarray, has_alpha: bool) -> np.ndarray:

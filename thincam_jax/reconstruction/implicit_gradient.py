@@ -19,6 +19,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.admm import RELAXATION, AbstractSplitting, Admm, admm_map
@@ -89,6 +90,7 @@ class NeumannSeries(lx.AbstractLinearSolver):
         return True
 
 
+@any_rank
 def solve_fixed_point(
     problem: InverseProblem | AbstractSplitting,
     image: Image,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.module import AnyRank
 from thincam_jax.imaging.operators import Stacked
 from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod, State, admm_map
 from thincam_jax.reconstruction.iterate import CHUNK
@@ -20,7 +21,7 @@ from thincam_jax.reconstruction.splittings import admm_method
 
 
 @checked
-class Stream(eqx.Module):
+class Stream(AnyRank):
     r"""ADMM-TV of successive captures, a few iterations each, with image and duals kept.
 
     .. math:: q_t = T^m(q_{t-1};\, g_t)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import window_shape
@@ -49,6 +50,7 @@ class PixelNoise:
     found: str
 
 
+@any_rank
 def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
     """Noise of a prepared capture: of raw `counts`, by a sensor's calibration, or estimated."""
     log, how = prepared.log, "given"
@@ -188,6 +190,7 @@ class PreparedResult:
         return float(relative_residual(self.problem, self.found.image[:, None]))
 
 
+@any_rank
 def reconstruct_prepared(
     prepared: Prepared,
     solver: AbstractSolver,

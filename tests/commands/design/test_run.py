@@ -89,7 +89,7 @@ def test_what_is_written(whole):
     path, design, _ = whole
     assert {p.name for p in path.iterdir()} == {
         *(".lock", "config.yaml", "found.yaml", "design.json", "environment.json", "report.html"),
-        *("landscape.png", "responses.png", "mtf.png", "masks.png", "targets"),
+        *("inputs.json", "landscape.png", "responses.png", "mtf.png", "masks.png", "targets"),
         *("reconstructions-chart.png", "reconstructions-picture.png"),
     }
     assert skimage.io.imread(path / "landscape.png").shape[:2] == (660, 836)

@@ -49,6 +49,14 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
         on.exit_code == 0
         and json.loads((tmp_path / "c/training.json").read_text("utf-8"))["steps"] == 4
     )
+    # Another network of the same name is not that which the training began with.
+    kept = (out / NETWORK).read_bytes()
+    (out / NETWORK).write_bytes((tmp_path / "c" / NETWORK).read_bytes())
+    told = line(call(file, "--out", tmp_path / "c", *start, "--resume"))
+    assert f"began with another {out / NETWORK}; restore that, or begin in another folder" in told
+    (out / NETWORK).write_bytes(kept)
+    assert call(file, "--out", tmp_path / "c", *start, "--resume").exit_code == 0
+    assert call(file, "--out", tmp_path / "d", *start).exit_code == 0
 
 
 def test_what_cannot_be_used_is_told(file, tmp_path):

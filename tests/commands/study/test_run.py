@@ -19,10 +19,12 @@ from commands.sweep import mini
 from commands.test_cli import call
 
 from thincam_jax._core.environment import environment
+from thincam_jax._core.precision import double_precision, is_double
+from thincam_jax.commands import run_folder
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.report import render_report
-from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.run_folder import RunFolder, origin_of
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import page, run_study
@@ -124,6 +126,7 @@ def test_folder_holds_what_it_says_and_nothing_half(whole):
     study, path, _, _ = whole
     files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
     expected = {".lock", "config.yaml", "metrics.json", "environment.json", "report.html"}
+    expected |= {"inputs.json"}
     expected |= {"targets/chart.json", "targets/picture.json"}
     for target in ("chart", "picture"):
         shown = [f"{target}--{name}" for name in ("pairs", "scene", "conventional")]
@@ -221,6 +224,67 @@ def test_broken_result_of_a_target_is_done_again(home, whole):
     (folder.path / "targets" / "chart.json").write_text('{"metrics": {"conv', encoding="utf-8")
     assert folder.finished("chart") is None
     assert folder.finished("picture") is None
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "5", "NaN", '{"metrics": NaN}', "{}", '{"metrics": 1e999}', '{"a": "\\ud800"}']
+)
+def test_damaged_result_of_a_target_is_done_again(home, whole, text):
+    folder = RunFolder(home / "damaged")
+    folder.claim(whole[0].config)
+    folder.finish("chart", {"metrics": {}, "contrasts": {}})
+    assert folder.finished("chart") == {"metrics": {}, "contrasts": {}}
+    path = folder.path / "targets" / "chart.json"
+    changed = path.read_text("utf-8").replace('"contrasts": {}', '"contrasts": {"a": 1}')
+    for damaged in (text, changed, "[" * 100_000):
+        path.write_text(damaged, encoding="utf-8")
+        assert folder.finished("chart") is None
+
+
+class TestInputs:
+    """What a resumed run takes up came from the same files, package and precision."""
+
+    def claimed(self, tmp_path):
+        folder, config = RunFolder(tmp_path / "out"), tiny.study(tmp_path)
+        folder.claim(config)
+        folder.finish("chart", {"metrics": {}})
+        folder.claim(config)
+        assert folder.finished("chart") == {"metrics": {}}
+        return folder, config
+
+    def test_another_picture(self, tmp_path):
+        folder, config = self.claimed(tmp_path)
+        skimage.io.imsave(tmp_path / "picture.png", np.eye(48, dtype=np.uint8) * 255)
+        assert folder.changed(config) == [str(tmp_path / "picture.png")]
+        folder.claim(config)
+        assert folder.finished("chart") is None
+
+    def test_another_package(self, tmp_path, monkeypatch):
+        folder, config = self.claimed(tmp_path)
+        monkeypatch.setattr(run_folder, "installed", lambda names: dict.fromkeys(names, "0.0"))
+        assert folder.changed(config) == ["thincam_jax"]
+        folder.claim(config)
+        assert folder.finished("chart") is None
+
+    def test_another_precision(self, tmp_path):
+        folder, config = self.claimed(tmp_path)
+        with double_precision(not is_double()):
+            assert folder.changed(config) == ["precision"]
+
+    def test_a_folder_without_a_record_of_them(self, tmp_path):
+        folder, config = self.claimed(tmp_path)
+        (folder.path / "inputs.json").write_text("5", encoding="utf-8")
+        folder.claim(config)
+        assert folder.finished("chart") is None
+
+    def test_all_files_of_a_folder_count(self, tmp_path):
+        (tmp_path / "images").mkdir()
+        (tmp_path / "images" / "a.png").write_bytes(b"a")
+        mask = tiny.study(tmp_path).mask.model_copy(update={"path": str(tmp_path / "images")})
+        before = origin_of(mask)
+        assert list(before)[2:] == [str(tmp_path / "images" / "a.png")]
+        (tmp_path / "images" / "b.png").write_bytes(b"b")
+        assert len(origin_of(mask)) == len(before) + 1
 
 
 def test_folder_of_another_study_is_refused(whole, home):

@@ -253,11 +253,10 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
 
 def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     """Read the captured frames of a store."""
-    import json
 
     import numpy as np
 
-    from thincam_jax._core.files import read_regular
+    from thincam_jax._core.files import read_json
     from thincam_jax.commands.capture.run import Taken, picture_levels
     from thincam_jax.hardware.acquisition.read import read_acquisition
     from thincam_jax.hardware.displays.grey_levels import measured_levels
@@ -293,6 +292,6 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         [pattern.label for pattern in patterns],
         [_shown(render, pattern) for pattern in patterns if config.display.pitch],
         [one.exposure for one in found.settings],
-        json.loads(read_regular(seconds)) if seconds.is_file() else {},
+        read_json(seconds) if seconds.is_file() else {},
         calibration,
     )

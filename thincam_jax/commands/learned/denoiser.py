@@ -60,7 +60,7 @@ class DenoiserConfig(LearningConfig):
 
 def run_denoiser(config: DenoiserConfig, place: InFolder) -> Ended:
     """Train a denoiser; writes training.json last. **Errors**: as of `InFolder`."""
-    place.check()
+    place.check(config)
     folder, network, lessons = place.folder, build_network(config), build_lessons(config)
     trained = place.train(config, train_denoiser, network, lessons)
     state = trained.state

@@ -94,7 +94,7 @@ class LearnedConfig(LenslessConfig, LearningConfig):
 def run_training(config: LearnedConfig, place: InFolder) -> Ended:
     """Train and report; writes training.json last. **Errors**: as of `InFolder`."""
     started, folder = time.time(), place.folder
-    place.check()
+    place.check(config)
     untrained, lessons = build_network(config), build_lessons(config)
     trained = place.train(config, train, untrained, lessons)
     result = judge_training(trained, untrained, lessons.validation(trained.model, config.seed))

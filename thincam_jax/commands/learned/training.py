@@ -95,9 +95,9 @@ class InFolder:
     callback: Callable[[TrainingProgress], object]
     resume: bool = False
 
-    def check(self) -> None:
+    def check(self, config: Any) -> None:
         """**Errors**: ConfigError where the folder has a state and `resume` is not asked for, or
-        the other way round."""
+        the other way round, and where the state came from other inputs."""
         path = self.folder.path
         begun = any(path.glob("training*.state"))
         if begun and not self.resume:
@@ -106,6 +106,9 @@ class InFolder:
             )
         if self.resume and not begun:
             raise ConfigError(f"--resume: {path} holds no training yet; leave it out")
+        if begun and (changed := self.folder.changed(config)):
+            text = f"began with another {changed[0]}; restore that, or begin in another folder"
+            raise ConfigError(f"--resume: the training in {path} {text}")
 
     def train(
         self, config: Any, train: Callable[..., Trained], network: Any, lessons: Any

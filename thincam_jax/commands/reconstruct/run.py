@@ -247,7 +247,8 @@ def _reconstruct(
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
     problem, has_tau = done.problem, recipe.method not in ("ridge", "pnp")
-    assert isinstance(prior := problem.regulariser, TotalVariation)
+    prior = problem.regulariser
+    assert isinstance(prior, TotalVariation)
     return asdict(done.facts) | {
         "asked_for": recipe.method,
         "reason": choose_solver(done.recording)[1] if recipe.method == "auto" else "",

@@ -1,20 +1,17 @@
 """The points of a sweep: their configurations and keys, and how a worker measures one."""
 
 import copy
-import hashlib
 import itertools
 import json
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
-from pathlib import Path
 from typing import Any
 
-from thincam_jax._core.files import read_regular
 from thincam_jax._core.precision import double_precision
 from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, Places, set_entry
+from thincam_jax.commands.run_folder import digest, origin_of
 from thincam_jax.commands.sections import StudyConfig, exposures_of
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.sweep.grid import Axis
@@ -117,15 +114,13 @@ def _entry(config: Any, place: tuple) -> Any:
 
 
 def _key(config: StudyConfig, text: str, double: bool) -> str:
-    versions = f"{METRICS_VERSION} {metadata.version('thincam_jax')} {'double' if double else ''}"
-    pictures = [Path(target.path) for target in config.targets if target.path]
-    # A picture that is not there is the worker's to report.
-    contents = [hashlib.sha256(read_regular(p)).hexdigest() for p in pictures if p.is_file()]
-    return _digest("\n".join([versions, text, *contents]))
+    """A picture that is not there is the worker's to report."""
+    with double_precision(double):
+        return _digest(json.dumps([METRICS_VERSION, text, origin_of(config)]))
 
 
 def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
+    return digest(text)[:16]
 
 
 @dataclass(frozen=True)

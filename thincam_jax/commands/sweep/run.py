@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow import csv
 
-from thincam_jax._core.files import read_regular, write_whole
-from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax._core.files import write_whole
+from thincam_jax.commands.run_folder import RunFolder, read_entries
 from thincam_jax.commands.sweep.point import GridPoint, Outcome, described, measure_point, one_line
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 
@@ -57,8 +57,8 @@ class SweepFolder(RunFolder):
             row = read_row(self._row(point))
             if row is not None:
                 rows.append((point.values, row))
-            elif self._failure(point).exists():
-                failures.append(json.loads(read_regular(self._failure(point))))
+            elif failure := read_entries(self._failure(point)):
+                failures.append(failure)
         found = joined(rows) if rows else None
         for name, content in (
             ("results.parquet", None if found is None else table_bytes(pq.write_table, found)),

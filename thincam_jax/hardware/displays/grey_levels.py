@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
-from thincam_jax._core.files import read_regular, write_whole
+from thincam_jax._core.files import read_json, write_whole
 from thincam_jax.hardware.base import Display
 from thincam_jax.hardware.errors import OutOfRange
 
@@ -55,7 +55,7 @@ class GreyLevels:
     def read(cls, path: str | PathLike[str]) -> "GreyLevels":
         """Read the table of a file; ValueError, one line, for an invalid one."""
         try:
-            content = json.loads(read_regular(path))
+            content = read_json(path)
             table = np.asarray(content["table"])
             if table.dtype.kind != "i" or np.any((table < 0) | (table >= LEVELS)):
                 raise ValueError("its levels are no whole numbers from 0 to 255")

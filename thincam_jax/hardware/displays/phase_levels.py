@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from thincam_jax._core import checks
-from thincam_jax._core.files import read_regular, write_whole
+from thincam_jax._core.files import read_json, write_whole
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import FieldError, check_fields, quantity
 from thincam_jax.hardware.displays.grey_levels import LEVELS
@@ -59,7 +59,7 @@ class PhaseLevels:
     def read(cls, path: str | PathLike[str]) -> "PhaseLevels":
         """Read the table of a file; ValueError, one line, for an invalid one."""
         try:
-            content = json.loads(read_regular(path))
+            content = read_json(path)
             return cls(**{**content, "phases": tuple(content["phases"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} holds no table of phases: {error}") from error

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray, PyTree
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import AnyRank
 from thincam_jax._core.precision import flat_root
 
 Shapes = PyTree[tuple[int, ...]]
 
 
-class AbstractOperator(eqx.Module):
+class AbstractOperator(AnyRank):
     r"""A real linear map A from an image to a capture, and its transpose.
 
     Both maps take any leading batch axes. The adjoint belongs to the plain sum of products,

@@ -1,5 +1,6 @@
 """Photographs: from a file, from scikit-image's own samples, and resampled to a pixel count."""
 
+import io
 import os
 import warnings
 from importlib import resources
@@ -7,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import skimage
+import tifffile
 from jaxtyping import ArrayLike, Float64, Num
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.image_files import ImageFileError, kind_of, read_whole
 
 # Files inside the scikit-image package itself; other names of `skimage.data` need a download.
 _PLAIN = (
@@ -59,7 +62,11 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            pixels = np.asarray(skimage.io.imread(path))
+            data = io.BytesIO(read_whole(path, kind := kind_of(path)))
+            read = tifffile.imread if kind == "tiff" else skimage.io.imread
+            pixels = np.asarray(read(data))
+    except ImageFileError as error:
+        raise ValueError(f"{str(path)!r} {error}") from None
     except Exception as error:  # each decoder raises its own kind
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ValueError(

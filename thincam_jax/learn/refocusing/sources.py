@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from thincam_jax._core.files import read_regular
+from thincam_jax._core.files import file_digest, read_regular
 from thincam_jax.imaging.targets import load_image, middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 
@@ -72,8 +72,7 @@ def read_photographs(
     if not files:
         raise ValueError(f"{str(folder)!r} holds no image; give a folder of {', '.join(_SUFFIXES)}")
     licence = licence or _licence(folder)
-    hashes = [hashlib.sha256(read_regular(path)).hexdigest() for path in files]
-    entries = [Entry(p.name, digest, licence) for p, digest in zip(files, hashes, strict=True)]
+    entries = [Entry(path.name, file_digest(path), licence) for path in files]
     return [(load_image(path), entry) for path, entry in zip(files, entries, strict=True)]
 
 
@@ -116,6 +115,6 @@ def _square(image: np.ndarray, side: int) -> Float32[np.ndarray, "side side"]:
 def _licence(folder: Path) -> str:
     for name in _LICENCE_FILES:
         if (folder / name).is_file():
-            lines = read_regular(folder / name).decode("utf-8", "replace").splitlines()
+            lines = read_regular(folder / name, 2**20).decode("utf-8", "replace").splitlines()
             return next((line.strip() for line in lines if line.strip()), "unknown")
     return "unknown"

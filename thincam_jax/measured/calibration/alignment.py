@@ -20,9 +20,8 @@ import numpy as np
 import scipy
 import skimage
 from jaxtyping import Float, UInt8
-from skimage.transform import ProjectiveTransform, SimilarityTransform
 
-from thincam_jax._core.files import MeasurementError, read_regular, write_whole
+from thincam_jax._core.files import MeasurementError, read_json, write_whole
 from thincam_jax._core.grids import block_mean
 
 MapKind = Literal["similarity", "homography"]
@@ -141,7 +140,7 @@ class Alignment:
     def read(cls, path: str | PathLike[str]) -> "Alignment":
         """Read such a file; ValueError, one line, for another one."""
         try:
-            given = json.loads(read_regular(path))
+            given = read_json(path)
             arrays = {name: np.array(given[name], float) for name in ("unknowns", "covariance")}
             found = cls(**given | arrays | {"shape": tuple(given["shape"])})
             found.summary()
@@ -168,7 +167,8 @@ def fit_alignment(
 
     **Errors**: MeasurementError, one line, where no more marks agree than determine the map.
     """
-    form, least = (SimilarityTransform, 2) if kind == "similarity" else (ProjectiveTransform, 4)
+    name, least = ("Similarity", 2) if kind == "similarity" else ("Projective", 4)
+    form = getattr(skimage.transform, f"{name}Transform")
     there = np.array([one is not None for one in seen])
     places, covariance = (np.array([one[k] for one in seen if one is not None]) for k in (0, 1))
     first, agree, used = None, None, 0
@@ -205,7 +205,7 @@ def _matrix(unknowns: np.ndarray) -> Float[np.ndarray, "3 3"]:
 
 
 def _mapped(unknowns: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return ProjectiveTransform(_matrix(unknowns))(points)
+    return skimage.transform.ProjectiveTransform(_matrix(unknowns))(points)
 
 
 def _at_middle(unknowns: np.ndarray) -> np.ndarray:
