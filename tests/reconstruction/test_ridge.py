@@ -62,6 +62,58 @@ def test_it_is_the_dense_solution(more):
         np.testing.assert_allclose(found.image, dense(problem, precision, mean), atol=1e-6)
 
 
+def ill_conditioned(snr, captures=2, shape=(13, 17), seed=0):
+    """A recording of random PSFs, which leave much of the field all but unseen."""
+    rng = np.random.default_rng(seed)
+    psfs = rng.random((captures, 9, 9)) / 20
+    scene = scenes.blocks(shape, seed)
+    clean = np.stack([scipy.signal.fftconvolve(scene, one, "same") for one in psfs])
+    deviation = clean.std() * 10 ** (-snr / 20)
+    seen = clean + deviation * rng.standard_normal(clean.shape)
+    return tc.Recording(seen, tc.Psfs(psfs), noise_variance=deviation**2, background=0.0)
+
+
+def as_precise(problem, dtype):
+    """The problem in another precision."""
+    numbers = {"f": dtype, "c": np.result_type(dtype, np.complex64)}
+    return jax.tree.map(
+        lambda a: a.astype(numbers[a.dtype.kind]) if a.dtype.kind in numbers else a, problem
+    )
+
+
+CONDITIONS = [(40, 2, 0.01), (40, 2, 1.0), (30, 1, 0.01), (20, 3, 0.1)]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("snr", "captures", "strength"), quick(CONDITIONS, 0))
+def test_the_tolerance_is_the_distance_from_the_minimiser(snr, captures, strength, dtype):
+    """Down to 1/μ = 8e6, where residuals of 1e-4 had left an error of 97 %, said to converge."""
+    solver = tc.Ridge(strength)
+    _, problem, mean, _, precision = solver._posed(ill_conditioned(snr, captures))
+    exact = dense(problem, precision, np.broadcast_to(mean, problem.image_shape))
+    found = solve_ridge(
+        as_precise(problem, dtype),
+        precision=precision,
+        mean=mean.astype(dtype),
+        iterations=solver.iterations,
+        tolerance=solver.tolerance,
+    )
+    assert found.status == "converged" and found.image.dtype == dtype
+    away = np.linalg.norm(exact - np.asarray(mean))
+    assert np.linalg.norm(np.asarray(found.image, float) - exact) < 2 * solver.tolerance * away
+    assert found.history[-1].primal < solver.tolerance
+
+
+def test_what_was_not_reached_is_said_and_its_advice_helps():
+    recording = ill_conditioned(40)
+    found = tc.reconstruct(recording, tc.Ridge(0.01, iterations=100))
+    assert found.status == "iterations_exhausted" and found.history[-1].primal > 1e-3
+    assert "of it, after 100 iterations: give more, a larger ridge, or double" in found.reason
+    for better in (tc.Ridge(0.01), tc.Ridge(10.0, iterations=100)):
+        settled = tc.reconstruct(recording, better)
+        assert settled.status == "converged" and not settled.reason
+
+
 def test_too_few_iterations_have_a_status_and_yet_a_lower_objective():
     problem, _ = scenes.problem()
     outcome = few(problem, iterations=3)

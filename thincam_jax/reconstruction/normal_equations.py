@@ -45,11 +45,15 @@ from thincam_jax.reconstruction.problem import (
     detector_shape,
     forward,
     or_one,
+    without_background,
 )
 
 # Of conjugate gradients within an iteration, relative to the right-hand side.
 INNER_TOLERANCE = {"float32": 1e-5, "float64": 1e-10}
 INNER_STEPS = 500
+# Steps between two estimates of the error, at least, and pixels below which conjugate gradients end
+# sooner without a filter.
+_SPAN, _FEW = 8, 1024
 # In units of the machine's, of the eigenvalues of convolutions, relative to the largest.
 _ROUNDING = 10
 
@@ -227,18 +231,72 @@ class IterativeNormal(AbstractNormal):
             lambda image: factor * self.applied(image), structure, tags
         )
         options: dict[str, Any] = {"y0": guess / factor}
-        filtered = None
-        if self.powers is not None:
-            filtered = functools.partial(_filtered, self.inverse_filter())
-        elif self.modes is not None:
-            filtered = functools.partial(_by_modes, self.modes, self.shift)
-        if filtered is not None:
+        if (filtered := self._filter()) is not None:
             options["preconditioner"] = lineax.FunctionLinearOperator(filtered, structure, tags)
         size = jnp.sqrt(jnp.mean(right**2))
         limits: dict[str, Any] = {"rtol": tolerance, "atol": tolerance * size}
         solver = lineax.CG(**limits, norm=optimistix.rms_norm, max_steps=steps)
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
+
+    def _filter(self):
+        """The preconditioner, if there is one."""
+        if self.powers is not None:
+            return functools.partial(_filtered, self.inverse_filter())
+        return self.modes and functools.partial(_by_modes, self.modes, self.shift)
+
+    def least_squares(
+        self, captures: tuple[Float[Array, "..."], ...], tolerance: Number, steps: int
+    ) -> tuple[Float[Array, "..."], Float[Array, ""], Float[Array, ""], Array]:
+        r"""z of b = Σ Aᵀwg, ⟨b, z⟩, the error relative to z that is left, and the steps taken.
+
+        Conjugate gradients from 0 that keep the residuals d = g − A z, which round by far less
+        than b − (AᵀA + μ) z (Björck, Elfving and Strakoš, SIAM J. Matrix Anal. Appl. 19, 720,
+        1998). The error follows from the changes δ of z over spans of a quarter of the steps: with
+        q the slower of the last two ratios of δ, it is :math:`\delta\,q/(1 - q)`, and
+        :math:`\epsilon\|\sqrt{w} d\|/4\mu` for the rounding.
+        """
+        problem, shift = self.problem, self.shift
+        captures = without_background(problem, captures)
+        slope = back_projected(problem, captures)
+        eps = jnp.finfo(slope.dtype).eps
+        filtered = self._filter() if math.prod(slope.shape[-3:]) > _FEW else None
+        ahead = filtered or (lambda image: image)
+
+        def squares(seen):
+            return sum(jnp.sum(w * d**2) for w, d in zip(problem.weights, seen, strict=True))
+
+        def advance(state):
+            (z, left, slope, along, power), memory, step = state
+            seen = [forward(operator, along) for operator in problem.operators]
+            seen = without_background(problem, seen)
+            length = jnp.sum(slope * along) / or_one(squares(seen) + shift * jnp.sum(along**2))
+            z = z + length * along
+            left = tuple(d - length * a for d, a in zip(left, seen, strict=True))
+            slope = back_projected(problem, left) - shift * z
+            downhill = ahead(slope)
+            before, power = power, jnp.sum(slope * downhill)
+            along, step = downhill + power / or_one(before) * along, step + 1
+
+            def look(memory):
+                change = jnp.linalg.norm(z - memory[0])
+                ratio = change / or_one(memory[1])
+                slower = jnp.maximum(ratio, memory[2])
+                to_come = jnp.where(slower < 0.95, change * slower / (1 - slower), jnp.inf)
+                error = to_come + eps / 4 * jnp.sqrt(squares(left)) / shift
+                due = step + jnp.maximum(_SPAN, step // 4)
+                return z, change, ratio, due, error / or_one(jnp.linalg.norm(z))
+
+            memory = jax.lax.cond(step == memory[3], look, lambda memory: memory, memory)
+            return (z, left, slope, along, power), memory, step
+
+        zero, never = jnp.zeros_like(slope), jnp.asarray(jnp.inf, slope.dtype)
+        first = ahead(slope)
+        start = (zero, captures, slope, first, jnp.sum(slope * first))
+        memory = (zero, never, never, jnp.asarray(_SPAN), never)
+        going = lambda state: (state[1][4] > tolerance) & (state[2] < steps)  # noqa: E731
+        (z, *_), memory, step = jax.lax.while_loop(going, advance, (start, memory, jnp.asarray(0)))
+        return z, jnp.sum(slope * z), memory[4], step
 
     def inverse_filter(self) -> Complex[Array, "channel p q v u"]:
         """(AᵀwA + μ)⁻¹ of the planes p, q at each frequency of a convolution's field."""
