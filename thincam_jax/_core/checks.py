@@ -41,6 +41,7 @@ _LARGEST_COUNT, _LARGEST_SIDE, _MOST_CELLS = 2**31 - 1, 10**12, 10**7
 _LEAST_SCALE = 1e-15
 # Units of plain ratios, which nobody writes.
 _RATIOS = ("parts of one", "a ratio", "")
+MOST_BITS = 1000  # of a whole number that a float holds
 _ON_HOST = ContextVar("on_host", default=False)
 
 
@@ -51,15 +52,31 @@ def is_traced(value: Any) -> bool:
 
 def holds_traced(*values: Any) -> bool:
     """Whether a leaf of the values, pytrees, is not known yet."""
-    return any(map(is_traced, jax.tree.leaves(values)))
+    return not holds_itself(values) and any(map(is_traced, jax.tree.leaves(values)))
+
+
+def holds_itself(value: Any) -> bool:
+    """Whether a list is inside itself."""
+    try:
+        jax.tree.structure(value)
+    except (RecursionError, SystemError):
+        return True
+    return False
 
 
 def _known(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is traced; of type object for what is none."""
     try:
-        return None if is_traced(value) else np.asarray(value)
-    except ValueError:  # lists of different lengths
+        return None if is_traced(value) else native(value)
+    except (ValueError, TypeError, RecursionError):  # lists of different lengths, random keys
         return np.asarray(None)
+
+
+def native(value: Any) -> np.ndarray:
+    """A NumPy array in the byte order of the machine, and of no more than double precision."""
+    known = np.asarray(value)
+    dtype = {"g": np.dtype("d"), "G": np.dtype("D")}.get(known.dtype.char, known.dtype)
+    return known.astype(dtype.newbyteorder("="), copy=False)
 
 
 @contextlib.contextmanager
@@ -74,6 +91,8 @@ def on_host() -> Iterator[None]:
 
 def shown(value: Any) -> str:
     """A value in a message: short, and in one line."""
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python makes no text of more
+        return f"a whole number of {value.bit_length()} bits"
     if isinstance(value, np.ndarray | jax.Array) and np.size(value) > 4:
         return f"an array of {value.dtype} of shape {value.shape}"
     text = str(value) if isinstance(value, np.ndarray | np.generic | jax.Array) else repr(value)
@@ -118,7 +137,7 @@ def as_array(value: Any, *, floating: bool = False) -> Array:
         if not value.weak_type and not (floating and value.dtype.kind in "iub"):
             return value
     elif not holds_traced(value):
-        known = np.asarray(value)
+        known = native(value)
         if floating and known.dtype.kind in "iub":
             known = known.astype(float)
         return jax.device_put(known, may_alias=False)
@@ -153,7 +172,7 @@ def array(name: str, value: Any, *, allow_complex: bool = False) -> Array:
 
 
 def _require_numbers(name: str, value: Any, dtype: np.dtype, allow_complex: bool) -> None:
-    if dtype.kind not in ("fiubc" if allow_complex else "fiub"):
+    if getattr(dtype, "kind", "O") not in ("fiubc" if allow_complex else "fiub"):
         kind = "numbers" if allow_complex else "real numbers"
         raise TypeError(f"{name} is {shown(value)}; give an array of {kind}")
 

@@ -15,10 +15,14 @@ from typing import Any
 import numpy as np
 
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax._core.text import escaped
 
 
 class MeasurementError(ValueError):
     """A measurement that cannot be used; one line says what was given and what to do."""
+
+    def __str__(self) -> str:
+        return escaped(super().__str__())  # a name may hold marks that a terminal obeys
 
 
 class TooLargeError(ValueError):

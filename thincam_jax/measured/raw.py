@@ -42,7 +42,7 @@ class Raw:
     def __post_init__(self):
         try:
             pixels = np.asarray(self.pixels)
-        except ValueError:
+        except (ValueError, TypeError):  # rows of several lengths, random keys
             raise MeasurementError(f"{self.name}: is no array; give rows of one length") from None
         _check_shape(self.name, pixels)
         _check_type(self.name, pixels)
