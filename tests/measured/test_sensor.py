@@ -1,10 +1,12 @@
 """A sensor's calibration: against simulated sensors whose numbers are known."""
 
+import runpy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from helpers import ROOT
 from thincam_jax.measured import (
     ExposedFrames,
     MeasurementError,
@@ -16,6 +18,7 @@ from thincam_jax.measured import (
 )
 from thincam_jax.studies import pixel_noise
 
+BENCHMARK = str(ROOT / "benchmarks/photon_transfer.py")
 SHAPE, FULL = (61, 90), 4095
 GAIN, READ = 0.35, 6.0  # counts per electron, electrons
 TIMES = (0.005, 0.02, 0.05, 0.1, 0.2)  # s
@@ -114,6 +117,61 @@ def test_line_of_photon_transfer_is_that_of_numpy(sensor):
     weights = 1 / found.photon_transfer[:, 2]
     slope = np.linalg.lstsq((weights * means)[:, None], weights * excess, rcond=None)[0][0]
     assert found.conversion_gain == pytest.approx(slope, abs=0.2 * found.conversion_gain_error)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return {one.name: one for one in runpy.run_path(BENCHMARK)["SENSORS"]}
+
+
+def z(found, name, truth):
+    return abs(getattr(found, name) - truth) / getattr(found, f"{name}_error")
+
+
+@pytest.mark.parametrize(
+    "name", ["read noise 0.25 counts", "read noise 0.1 counts", "row noise", "row and column noise"]
+)
+def test_rounding_and_lines_are_no_read_noise(simulated, name):
+    """They were 0.02 to 1 of it, over ten standard errors, without a word."""
+    truth = simulated[name]
+    found = truth.measured(3)
+    assert z(found, "read_noise", truth.read) < 4 and z(found, "conversion_gain", truth.gain) < 4
+    assert found.read_noise_error < 0.03 * truth.read and not found.findings
+    assert found.defective.sum() <= 2
+    lines = np.hypot(truth.rows, truth.columns)
+    assert found.line_noise == pytest.approx(lines, rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["2 % non-linear", "0.5 % non-linear"])
+def test_a_response_that_is_not_linear_is_found(simulated, name):
+    truth = simulated[name]
+    found = truth.measured(3)
+    assert z(found, "conversion_gain", truth.gain) < 4 and found.bend < 0
+    assert "not linear" in found.findings[0] and "expose less" in found.findings[0]
+
+
+def test_findings_say_what_the_frames_cannot_show(simulated):
+    """Each goes when its advice is followed."""
+    one = simulated["one exposure"].measured(3)
+    assert "take dark frames of a second exposure" in one.findings[0]
+    assert "1 usable exposures" in one.findings[1] and "take three or more" in one.findings[1]
+    assert not simulated["typical"].measured(3).findings
+    alike = simulated["and one dark level"]
+    (hidden,) = alike.measured(3).findings
+    assert "up to 10 electrons" in hidden and "raise the analogue gain" in hidden
+    assert not replace(alike, gain=0.4).measured(3).findings
+    bent = simulated["2 % non-linear"]
+    assert bent.measured(3).findings and not replace(bent, brightest=0.02).measured(3).findings
+
+
+@pytest.mark.thorough
+def test_two_sigma_cover_or_the_findings_say_why(simulated):
+    for truth in simulated.values():
+        every = [truth.measured(seed) for seed in range(100)]
+        silent = [one for one in every if not one.findings]
+        for name, value in (("conversion_gain", truth.gain), ("read_noise", truth.read)):
+            off = [z(one, name, value) > 2 for one in silent]
+            assert sum(off) <= 12, (truth.name, name)  # 5 of 100 by chance
 
 
 def test_flicker_of_the_lamp_is_no_noise(sensor):

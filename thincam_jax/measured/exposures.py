@@ -135,20 +135,26 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     )
 
 
-def moments(one: ExposedFrames, full_scale: int) -> np.ndarray:
+def moments(one: ExposedFrames, full_scale: int, lines: bool = False) -> np.ndarray:
     """Maps of the light's mean and variance, of the dark's, and where no frame is full."""
     seen = one.frames.max(axis=0) < full_scale
     counted = seen if seen.any() else ~seen
     dark = one.dark.mean(axis=0, dtype=float)
     light = one.frames.mean(axis=0, dtype=float) - dark
     # A lamp's flicker changes all pixels in proportion to their light, and is no noise.
-    variance = _variance(one.frames, light / (light.mean(where=counted) or 1.0), counted)
-    return np.stack([light, variance, dark, _variance(one.dark, np.ones_like(dark), counted), seen])
+    lit = variance(one.frames, light / (light.mean(where=counted) or 1.0), counted, lines)
+    return np.stack(
+        [light, lit, dark, variance(one.dark, np.ones_like(dark), counted, lines), seen]
+    )
 
 
-def _variance(frames: np.ndarray, profile: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Variance among frames, unbiased, without a common change of the pixels by a profile."""
+def variance(frames: np.ndarray, profile: np.ndarray, seen: np.ndarray, lines: bool) -> np.ndarray:
+    """Unbiased, among frames, without a common change by a profile and what `lines` share."""
     mean, squares = frames.mean(axis=0, dtype=float), np.zeros_like(profile)
     for frame in frames:
-        squares += (frame - mean - (frame - mean).mean(where=counted) * profile) ** 2
-    return squares / (len(frames) - 1)
+        rest = frame - mean - (frame - mean).mean(where=seen) * profile
+        if lines:
+            rest += rest.mean() - rest.mean(axis=1, keepdims=True) - rest.mean(axis=0)
+        squares += rest**2
+    left = np.prod(1 - 1 / np.array(profile.shape)) if lines else 1.0
+    return squares / (len(frames) - 1) / left

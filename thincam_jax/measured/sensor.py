@@ -10,6 +10,10 @@ of response f, 1 in the mean, has at the exposure t and for light of u counts
 with K counts per electron, the read noise :math:`\sigma_d` in electrons, and 1/12 for whole counts.
 The electrons of light and of dark current are Poisson numbers. So the variance grows with the mean,
 and K is the slope: the photon transfer method (EMVA 1288, release 3.1, equation 9).
+
+Whole counts add 1/12 to noise s of half a count or more. For means anywhere between counts, their
+squared biases, :math:`\sum_k e^{-(2\pi s k)^2}/2\pi^2k^2`, are taken off it (Widrow and Kollár,
+Quantization Noise, 2008). A response u (1 − a u) makes V = K Y (1 − 3 a Y).
 """
 
 import io
@@ -25,7 +29,7 @@ from jaxtyping import Bool, Float
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import MeasurementError, read_arrays, write_whole
 from thincam_jax._core.text import of_error
-from thincam_jax.measured.exposures import ExposedFrames, moments
+from thincam_jax.measured.exposures import ExposedFrames, moments, variance
 from thincam_jax.measured.raw import Raw
 
 _ROUNDING = 1 / 12  # variance of whole counts
@@ -45,6 +49,8 @@ class SensorCalibration:
     - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; without a rate, with
       that of the dark current.
     - `photon_transfer`: of each level, mean light, counts, additional variance and its error.
+    - `line_noise`: of rows and columns, electrons, beside the read noise. `bend`: change of V/Y up
+      to the brightest level, relative. Both 0 if not seen.
     - `_error`: standard error. All hold for one gain, black level, format, binning and region.
     """
 
@@ -62,6 +68,8 @@ class SensorCalibration:
     read_noise_error: float
     full_scale: int
     photon_transfer: Float[np.ndarray, "level 3"]
+    line_noise: float = 0.0
+    bend: float = 0.0
 
     def __post_init__(self):
         maps = [one for one in vars(self).values() if np.ndim(one) == 2]
@@ -69,6 +77,23 @@ class SensorCalibration:
         lit = len(shapes) == 1 and bool(np.all((self.response > 0) | self.defective))
         if not (lit and min(self.exposure, self.conversion_gain) > 0):
             raise MeasurementError(f"maps of {shapes}, no gain or no response; measure it again")
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """What contradicts the errors, or what the frames cannot show, and what to do."""
+        levels, most = len(self.photon_transfer), 0.5 / self.conversion_gain
+        flat = self.read_noise < most and self.dark_level[~self.defective].std() < 0.55
+        found = {
+            f"rounding may hide a read noise of up to {most:.3g} electrons, as all dark levels are "
+            "alike; raise the analogue gain": flat,
+            "the read noise has that of the dark current in it; take dark frames of a second "
+            "exposure": not self.dark_rate_error.any(),
+            f"{levels} usable exposures do not show whether the sensor is linear, as the errors "
+            "suppose; take three or more": levels < 3,
+            f"the response is not linear: bright light is off by some {abs(self.bend) / 3:.1%}, "
+            "and the gain is that of faint light; expose less": self.bend != 0 and not flat,
+        }
+        return tuple(text for text, holds in found.items() if holds)
 
     def at(self, exposure: float) -> "SensorCalibration":
         """Calibration for frames of another exposure, s; MeasurementError without a dark rate."""
@@ -96,8 +121,8 @@ class SensorCalibration:
         light, gain = raw.pixels - self.dark_level, self.conversion_gain
         per_response = np.where(self.defective, 0, 1 / np.where(self.defective, 1, self.response))
         photons = gain * np.maximum(light + self.dark_rate * self.exposure, 0)
-        variance = photons + (gain * self.read_noise) ** 2 + _ROUNDING + self.dark_level_error**2
-        variance += (light * self.response_error * per_response) ** 2
+        variance = photons + gain**2 * (self.read_noise**2 + self.line_noise**2) + _ROUNDING
+        variance += self.dark_level_error**2 + (light * self.response_error * per_response) ** 2
         return light * per_response, variance * per_response**2
 
     def save(self, path: str | Path) -> Path:
@@ -155,8 +180,16 @@ def measure_sensor(
         raise MeasurementError("dark counts of 0 hide their noise; raise the camera's black level")
     times = np.array([one.exposure for one in series])
     frames, darks = np.transpose([(len(one.frames), len(one.dark)) for one in series])
-    maps = np.swapaxes([moments(one, full_scale) for one in series], 0, 1)
-    light, variance, dark, dark_variance, seen = maps
+    maps = np.array([moments(one, full_scale) for one in series])
+    whole = np.ones(maps.shape[-2:], bool)
+    free = np.array([variance(one.dark, 1.0 * whole, whole, lines=True) for one in series])
+    # What rows and columns share among dark frames, and its deviation if they share nothing.
+    shared = (darks - 1) @ (maps[:, 3] - free).mean(axis=(1, 2)) / (darks - 1).sum()
+    chance = 2 * sum(1 / n for n in whole.shape) * np.mean(free**2) / whole.size
+    lines = float(shared) if shared > 5 * np.sqrt(chance / (darks - 1).sum()) else 0.0
+    if lines:
+        maps = np.array([moments(one, full_scale, lines=True) for one in series])
+    light, lit_variance, dark, dark_variance, seen = np.swapaxes(maps, 0, 1)
     used = np.mean(light + dark > 0.8 * full_scale, axis=(1, 2)) <= _FEW
     if not used.any():
         raise MeasurementError("the light is over 0.8 of full scale; give a shorter exposure")
@@ -171,42 +204,78 @@ def measure_sensor(
 
     odd = ~(seen[used].all(axis=0) & (total > 0))
     least = max(float(np.median(noise)), _ROUNDING)
+    # Rounding's biases of the means, squared, and the most that it makes of a pixel's variance.
+    true = float(_unrounded(rounded := np.mean(noise[noise <= 4 * least]))[0])
+    bias = max(true + _ROUNDING - rounded, 0.0)
     parts = *(line**2 / darks), counted  # of the variance of a frame
-    for values, part in zip((level, rate, total), parts, strict=True):
-        odd |= _stands_out(values, outlier, float(np.sqrt(least * part.sum())))
+    biases = [bias * np.abs(one).sum() ** 2 for one in (*line, counted)]
+    for values, part, one in zip((level, rate, total), parts, biases, strict=True):
+        odd |= _stands_out(values, outlier, float(np.sqrt((least + lines) * part.sum() + one)))
     high, half = scipy.special.chdtri(degrees.sum(), [scipy.special.ndtr(-outlier), 0.5])
-    odd |= noise > least * high / half
+    odd |= noise > max(least, (true < 0.25) * (true + 0.25)) * high / half
     good, scale = ~odd, np.ones_like(total)
     for place in _PLACES if mosaic else (np.s_[:, :],):
         scale[place] = total[place][good[place]].sum() / max(good[place].sum(), 1)
     if not (scale > 0).all():
         raise MeasurementError("the frames are no brighter than the dark ones; give more light")
 
-    excess = (variance - dark_variance)[used][:, good]
-    gain, in_gain, points = _photon_transfer(light[used][:, good], excess)
+    dark_variance = dark_variance[:, good]
+    unrounded, slopes = _unrounded(dark_variance.mean(axis=1))
+    lit = lit_variance[used][:, good]
+    excess = lit + (_unrounded(averages := lit.mean(axis=1))[0] - averages)[:, None]
+    excess -= dark_variance[used] + (unrounded - dark_variance.mean(axis=1))[used][:, None]
+    light = light[used][:, good]
+    levels = [series[i] for i in np.where(used)[0]]
+    bent = len(levels) > 2 and _is_bent(levels, light.mean(axis=1), good)
+    gain, in_gain, points, bend = _photon_transfer(light, excess, bent)
     # What each pixel adds to the errors: of the read noise's variance, then of it in electrons.
     current = rate[good] * (degrees @ times / degrees.sum())
-    read = noise[good] - gain * current - _ROUNDING
+    read = (degrees * slopes) @ dark_variance / degrees.sum() - gain * current
     in_read = (read - read.mean()) / read.size - current.mean() * in_gain
-    deviation = np.sqrt(max(read.mean(), np.linalg.norm(in_read)))
+    found = max(float(degrees @ unrounded / degrees.sum() - gain * current.mean()), 0.0)
+    deviation = np.sqrt(max(found, np.linalg.norm(in_read), 1e-12))
     in_electrons = in_read / (2 * deviation * gain) - deviation / gain**2 * in_gain
 
-    constant = max(float(read.mean()), 0.0) + _ROUNDING
+    constant = found + lines + _ROUNDING
     of_dark = np.maximum(constant + gain * np.multiply.outer(times, rate), _ROUNDING)
-    of_light = np.maximum(of_dark + gain * light, _ROUNDING)
+    of_light = np.maximum(of_dark + gain * maps[:, 0], _ROUNDING)
     of_light += of_dark * (frames / darks)[:, None, None]
     variances = *np.tensordot(line**2 / darks, of_dark, 1), np.tensordot(counted, of_light, 1)
-    errors = np.sqrt(np.stack(variances, dtype=np.float32))
+    errors = np.sqrt(np.stack(variances, dtype=np.float32) + np.reshape(biases, (3, 1, 1)))
     maps = level, errors[0], rate, errors[1], good * total / scale, good * errors[2] / scale
-    found = np.sqrt(max(read.mean(), 0.0)) / gain, np.linalg.norm(in_electrons)
-    numbers = map(float, (gain, np.linalg.norm(in_gain), *found))
+    of_read = np.sqrt(found) / gain, np.linalg.norm(in_electrons)
+    numbers = map(float, (gain, np.linalg.norm(in_gain), *of_read))
     single = [one.astype(np.float32) for one in maps]
     every: list[Any] = [middle, *single, odd, *numbers, full_scale, points]
-    return SensorCalibration(*every)
+    return SensorCalibration(*every, line_noise=float(np.sqrt(lines) / gain), bend=bend)
 
 
-def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """K, what each pixel adds to its error, and the line's points, of maps (level, pixel)."""
+def _unrounded(variance: Any) -> tuple[np.ndarray, np.ndarray]:
+    """s² of the variance in whole counts, and its derivative."""
+    s, k = np.linspace(0, 1, 201), np.arange(1, 1000)[:, None]
+    biases = (np.exp(-((2 * np.pi * s * k) ** 2)) / (2 * np.pi**2 * k**2)).sum(axis=0)
+    whole = s**2 + biases[0] - biases
+    below = np.interp(variance, whole, s**2)
+    found = np.where(variance < whole[-1], below, variance - _ROUNDING)
+    slope = np.asarray(np.interp(variance, whole, np.gradient(s**2, whole), right=1.0))
+    return np.asarray(found), slope
+
+
+def _is_bent(series: Sequence[ExposedFrames], means: np.ndarray, good: np.ndarray) -> bool:
+    """Whether light per second changes with the light by more than its scatter among frames."""
+    times, counts = np.array([(one.exposure, len(one.frames)) for one in series]).T
+    lit, dark = np.array(
+        [[f.mean((1, 2), where=good).var(ddof=1) for f in (o.frames, o.dark)] for o in series]
+    ).T
+    degrees, offset = counts - 1, dark / [len(one.dark) for one in series] + 1 / good.sum()
+    error = np.sqrt(degrees @ (lit / means**2) / degrees.sum() / counts + offset / means**2)
+    rate = means / times / np.average(means / times, weights=error**-2)
+    (slope, _), spread = np.polyfit(means, rate, 1, w=1 / error, cov="unscaled")
+    return bool(abs(slope) > scipy.special.stdtrit(degrees.sum(), 0.9995) * spread[0, 0] ** 0.5)
+
+
+def _photon_transfer(light: np.ndarray, excess: np.ndarray, bent: bool) -> tuple[Any, ...]:
+    """K, what each pixel adds to its error, the line's points and bend, of maps (level, pixel)."""
     means, averages = light.mean(axis=1), excess.mean(axis=1)
     scatter = (excess - averages.sum() / means.sum() * light).var(axis=1)
     weights = means / np.maximum(scatter, _ROUNDING)
@@ -214,8 +283,14 @@ def _photon_transfer(light: np.ndarray, excess: np.ndarray) -> tuple[float, np.n
     in_gain = weights @ (excess - gain * light) / (weights @ means) / light.shape[1]
     if not gain > 4 * np.linalg.norm(in_gain):
         raise MeasurementError("the variance does not grow with the light; give raw frames")
-    points = means, averages, np.sqrt(scatter / light.shape[1])
-    return gain, in_gain, np.stack(points, axis=1)
+    points = np.stack([means, averages, np.sqrt(scatter / light.shape[1])], axis=1)
+    powers = np.stack([light, light**2])
+    solve = np.linalg.pinv(powers.mean(axis=2).T / points[:, 2:]) / points[:, 2]
+    both = solve @ averages
+    in_both = solve @ (excess - np.tensordot(both, powers, 1)) / light.shape[1]
+    if len(means) < 3 or not (bent or abs(both[1]) > 3 * np.linalg.norm(in_both[1])):
+        return gain, in_gain, points, 0.0
+    return float(both[0]), in_both[0], points, float(both[1] * means.max() / both[0])
 
 
 def _stands_out(values: np.ndarray, outlier: float, error: float) -> np.ndarray:

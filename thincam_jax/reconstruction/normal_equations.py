@@ -51,8 +51,7 @@ from thincam_jax.reconstruction.problem import (
 # Of conjugate gradients within an iteration, relative to the right-hand side.
 INNER_TOLERANCE = {"float32": 1e-5, "float64": 1e-10}
 INNER_STEPS = 500
-# Steps between two estimates of the error, at least, and pixels below which conjugate gradients end
-# sooner without a filter.
+# Steps between estimates of the error, at least; pixels that are solved sooner without a filter.
 _SPAN, _FEW = 8, 1024
 # In units of the machine's, of the eigenvalues of convolutions, relative to the largest.
 _ROUNDING = 10
@@ -240,7 +239,6 @@ class IterativeNormal(AbstractNormal):
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
     def _filter(self):
-        """The preconditioner, if there is one."""
         if self.powers is not None:
             return functools.partial(_filtered, self.inverse_filter())
         return self.modes and functools.partial(_by_modes, self.modes, self.shift)
@@ -250,18 +248,16 @@ class IterativeNormal(AbstractNormal):
     ) -> tuple[Float[Array, "..."], Float[Array, ""], Float[Array, ""], Array]:
         r"""z of b = Σ Aᵀwg, ⟨b, z⟩, the error relative to z that is left, and the steps taken.
 
-        Conjugate gradients from 0 that keep the residuals d = g − A z, which round by far less
-        than b − (AᵀA + μ) z (Björck, Elfving and Strakoš, SIAM J. Matrix Anal. Appl. 19, 720,
-        1998). The error follows from the changes δ of z over spans of a quarter of the steps: with
-        q the slower of the last two ratios of δ, it is :math:`\delta\,q/(1 - q)`, and
-        :math:`\epsilon\|\sqrt{w} d\|/4\mu` for the rounding.
+        Conjugate gradients from 0 that keep the residuals d = g − A z, which round less (Björck,
+        Elfving and Strakoš, SIAM J. Matrix Anal. Appl. 19, 720, 1998). The error is δ q/(1 − q) of
+        the change δ over the last fifth of the steps, with q the slower of the last two ratios of
+        δ, and :math:`\epsilon\|\sqrt{w} d\|/4\mu` for rounding.
         """
         problem, shift = self.problem, self.shift
         captures = without_background(problem, captures)
         slope = back_projected(problem, captures)
-        eps = jnp.finfo(slope.dtype).eps
-        filtered = self._filter() if math.prod(slope.shape[-3:]) > _FEW else None
-        ahead = filtered or (lambda image: image)
+        few = math.prod(slope.shape[-3:]) <= _FEW
+        ahead = (not few and self._filter()) or (lambda image: image)
 
         def squares(seen):
             return sum(jnp.sum(w * d**2) for w, d in zip(problem.weights, seen, strict=True))
@@ -274,8 +270,7 @@ class IterativeNormal(AbstractNormal):
             z = z + length * along
             left = tuple(d - length * a for d, a in zip(left, seen, strict=True))
             slope = back_projected(problem, left) - shift * z
-            downhill = ahead(slope)
-            before, power = power, jnp.sum(slope * downhill)
+            before, power = power, jnp.sum(slope * (downhill := ahead(slope)))
             along, step = downhill + power / or_one(before) * along, step + 1
 
             def look(memory):
@@ -283,7 +278,7 @@ class IterativeNormal(AbstractNormal):
                 ratio = change / or_one(memory[1])
                 slower = jnp.maximum(ratio, memory[2])
                 to_come = jnp.where(slower < 0.95, change * slower / (1 - slower), jnp.inf)
-                error = to_come + eps / 4 * jnp.sqrt(squares(left)) / shift
+                error = to_come + jnp.finfo(z.dtype).eps / 4 * jnp.sqrt(squares(left)) / shift
                 due = step + jnp.maximum(_SPAN, step // 4)
                 return z, change, ratio, due, error / or_one(jnp.linalg.norm(z))
 
@@ -291,8 +286,7 @@ class IterativeNormal(AbstractNormal):
             return (z, left, slope, along, power), memory, step
 
         zero, never = jnp.zeros_like(slope), jnp.asarray(jnp.inf, slope.dtype)
-        first = ahead(slope)
-        start = (zero, captures, slope, first, jnp.sum(slope * first))
+        start = (zero, captures, slope, first := ahead(slope), jnp.sum(slope * first))
         memory = (zero, never, never, jnp.asarray(_SPAN), never)
         going = lambda state: (state[1][4] > tolerance) & (state[2] < steps)  # noqa: E731
         (z, *_), memory, step = jax.lax.while_loop(going, advance, (start, memory, jnp.asarray(0)))

@@ -99,10 +99,8 @@ class Ridge(AbstractSolver):
       choose it from the captures of a separable camera of one term, for the least error of the
       image; "likelihood" (of the captures under the prior) as the image varies, for error bars.
     - `synthesis`: as of `AdmmTV`.
-    - `iterations`: at most. `tolerance`: of the image's distance from the minimiser, relative to
-      that of the minimiser from the uniform image, both root mean square, as estimated along the
-      way. The `reason` of the result says so if it was not reached, and `history[-1].primal` by
-      how much.
+    - `iterations`: at most. `tolerance`: estimated distance of the minimiser over that between it
+      and the uniform image. `reason` and `history[-1].primal` say what was not reached.
 
     **Errors**: ValueError, one line, for values out of range.
 
@@ -276,9 +274,8 @@ def solve_ridge(
         mean = start_image(problem, mean)
     limit = jnp.asarray(tolerance, dtype)
     image, objectives, error, steps = _solve(problem, rho, mean, limit, iterations)
-    converged = bool(error <= limit)
     outcome = outcome_of_run(
-        mean, image, objectives, converged=converged, iterations=int(steps), began=began
+        mean, image, objectives, converged=bool(error <= limit), iterations=int(steps), began=began
     )
     before, after = outcome.history
     return replace(outcome, history=(before, replace(after, primal=float(error))))
@@ -297,7 +294,7 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
         change, explained, error, steps = found
     else:
         change, explained = normal.solve_captures(inside.captures)
-        error, steps = _closed(change), jnp.asarray(1)
+        error, steps = jnp.sum(0 * change), jnp.asarray(1)
     pairs = zip(inside.weights, inside.captures, strict=True)
     before = sum(jnp.sum(w * c**2) for w, c in pairs) / 2
     # Of the minimiser, and of every iterate of conjugate gradients from zero; without another A f.
@@ -318,12 +315,7 @@ def _by_modes(about: InverseProblem, curvature, normal: SeparableNormal, mean):
     before = jnp.sum((capture / unit) ** 2) / 2
     after = jnp.maximum(before - jnp.sum(pulled * kept) / 2, 0)
     scale = weight * unit**2
-    return image, (scale * before, scale * after), _closed(image), jnp.asarray(1)
-
-
-def _closed(image):
-    """The error of a closed form: none, or NaN of NaN."""
-    return 0 * jnp.sum(image)
+    return image, (scale * before, scale * after), jnp.sum(0 * image), jnp.asarray(1)
 
 
 @jax.jit
