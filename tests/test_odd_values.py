@@ -1,8 +1,6 @@
 """Values that NumPy and Python have and JAX has not: converted, or one line that names them."""
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -83,20 +81,6 @@ def test_numbers_of_other_orders_and_widths_are_converted(dtype):
     np.testing.assert_array_equal(tc.ImagePlane(image, 250.0, 40.0).image, same)
     np.testing.assert_array_equal(operators.Matrix(image, (2, 2), (3,)).matrix, same)
     np.testing.assert_array_equal(checks.numbers("image", image), same)
-
-
-def test_a_plain_number_in_place_of_an_array():
-    """As `equinox.tree_at` leaves it; what the message says to give is right."""
-    for find, name, value in (
-        (lambda c: c.mask.beta, "camera.mask.beta", 26.0),
-        (lambda c: c.distance, "camera.distance", 7),
-    ):
-        changed = eqx.tree_at(find, CAMERA, value)
-        with pytest.raises(TypeError) as caught:
-            tc.psf(changed, wavelength=500 * nm, object_distance=250.0)
-        assert str(caught.value) == f"{name} is {value}; give an array, jnp.asarray({value})"
-        changed = eqx.tree_at(find, CAMERA, jnp.asarray(value, CAMERA.distance.dtype))
-        tc.psf(changed, wavelength=500 * nm, object_distance=250.0)
 
 
 def test_marks_of_a_name_are_written_out(tmp_path):

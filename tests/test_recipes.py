@@ -81,7 +81,7 @@ def test_a_solver_finds_what_a_matrix_gives(key):
     psf = np.array([[0.0, 0.2, 0.0], [0.1, 0.4, 0.1], [0.0, 0.1, 0.1]])
     capture = np.asarray(jax.random.uniform(key, (5, 7)))
     psfs = tc.Psfs(np.pad(psf, ((1, 1), (2, 2)))[None])
-    recording = tc.Recording(capture[None, None], psfs, noise_variance=1.0)
+    recording = tc.Recording(capture[None, None], psfs, noise_variance=1.0, background=0.0)
     found = tc.reconstruct(recording, followed("a solver")["LeastSquares"](strength=0.01))
     pixels = np.eye(9 * 13).reshape(-1, 9, 13)
     seen = [scipy.signal.convolve2d(pixel, psf, "same")[2:-2, 3:-3].ravel() for pixel in pixels]

@@ -158,7 +158,7 @@ def test_findings_say_what_the_frames_cannot_show(simulated):
     assert not simulated["typical"].measured(3).findings
     alike = simulated["and one dark level"]
     (hidden,) = alike.measured(3).findings
-    assert "up to 10 electrons" in hidden and "raise the analogue gain" in hidden
+    assert "up to 9.99 electrons" in hidden and "raise the analogue gain" in hidden
     assert not replace(alike, gain=0.4).measured(3).findings
     bent = simulated["2 % non-linear"]
     assert bent.measured(3).findings and not replace(bent, brightest=0.02).measured(3).findings

@@ -1,6 +1,5 @@
 """Kinds of the objects that a public function or class is given, checked by its annotations."""
 
-import dataclasses
 import functools
 import inspect
 import os
@@ -10,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import AbstractArray, PRNGKeyArray
@@ -78,18 +76,11 @@ def checked(public: _Public) -> _Public:
 
 
 def _refuse_unsound(name: str, value: Any) -> None:
-    """Refuse numbers beyond those of floats, lists inside themselves, and modules with a number
-    in place of an array, as `equinox.tree_at` leaves them."""
+    """Refuse numbers beyond those of floats, and lists inside themselves."""
     if isinstance(value, int) and value.bit_length() > checks.MOST_BITS:
         raise ValueError(f"{name} is {checks.shown(value)}; give a smaller one")
     if isinstance(value, list | tuple) and checks.holds_itself(value):
         raise TypeError(f"{name} is a list inside itself; give numbers")
-    for field in dataclasses.fields(value) if isinstance(value, eqx.Module) else ():
-        one, kind = getattr(value, field.name, None), field.type
-        if type(one) in (int, float) and isinstance(kind, type) and issubclass(kind, AbstractArray):
-            raise TypeError(f"{name}.{field.name} is {one}; give an array, jnp.asarray({one})")
-        if isinstance(one, eqx.Module):
-            _refuse_unsound(f"{name}.{field.name}", one)
 
 
 def _words(kinds: _Kinds) -> str:

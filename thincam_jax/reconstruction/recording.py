@@ -152,7 +152,7 @@ class Recording(Module):
             "tau": tau,
             "regulariser": regulariser,
             "nonnegative": nonnegative,
-            "background": self._kind_of_background(synthesis),
+            "background": self._kind_of_background(synthesis, nonnegative),
         }
         operators = self._operators()
         if operators:
@@ -294,7 +294,7 @@ class Recording(Module):
             )
         return tuple(each)
 
-    def _kind_of_background(self, synthesis: Any) -> Background:
+    def _kind_of_background(self, synthesis: Any, nonnegative: bool) -> Background:
         """Not negative but in differences of captures, and if something was subtracted before."""
         if self.background is not None or isinstance(self.imaging_model, Stacked):
             return "known"
@@ -302,7 +302,7 @@ class Recording(Module):
         light = [c for c in captures if not checks.is_traced(c)]
         below = any(np.quantile(np.asarray(c), _DARKEST) < 0 for c in light)
         mixed = synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))
-        return "unknown" if below or mixed else "nonnegative"
+        return "nonnegative" if nonnegative and not (below or mixed) else "unknown"
 
     @property
     def light(self) -> tuple[Float[Array, "..."], ...]:

@@ -190,9 +190,11 @@ class Ridge(AbstractSolver):
 
     def _posed(self, recording):
         """The problem, the whitened problem, the mean, the prior and ρ."""
-        problem = recording.problem(synthesis=self.synthesis)
+        problem = recording.problem(nonnegative=False, synthesis=self.synthesis)
         # Sums in which the uniform light cancels do not show how bright the scene is; captures do.
-        level, mean = _uniform(problem if self.synthesis is None else recording.problem())
+        level, mean = _uniform(
+            problem if self.synthesis is None else recording.problem(nonnegative=False)
+        )
         given = 1.0 if isinstance(self.ridge, str) else self.ridge * image_precision(level)
         tried = []
         for correlation in self.correlation:
