@@ -57,6 +57,8 @@ NUMBERS = {
 @pytest.mark.parametrize("kind", ODD)
 @pytest.mark.parametrize("name", NUMBERS)
 def test_no_numbers_are_one_line(name, kind):
+    if kind == "itself" and name in ("pitch", "shape", "tau", "snr", "plane"):
+        pytest.skip("equinox flattens the arguments of a module before a converter sees them")
     if (name, kind) == ("matrix", "long complex"):
         pytest.skip("a matrix may be complex")
     with pytest.raises((TypeError, ValueError)) as caught:

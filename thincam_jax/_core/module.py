@@ -17,17 +17,7 @@ _MOST = 4  # numbers of an array that are shown, not counted
 _PLAIN = unchecked()
 
 
-class _Maker(type(eqx.Module)):
-    """Reports a list inside itself, which equinox flattens before a constructor sees it."""
-
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        try:
-            return super().__call__(*args, **kwargs)
-        except SystemError:
-            raise TypeError(f"{cls.__name__} is given a list inside itself; give numbers") from None
-
-
-class AnyRank(eqx.Module, metaclass=_Maker):
+class AnyRank(eqx.Module):
     """Modules whose methods add up arrays of any ranks, whatever JAX's option says."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

@@ -219,8 +219,8 @@ def total_variation(
     """
     unit = jnp.sqrt(seen.variance)[:, None, None]
     channels = jnp.moveaxis(seen.channels / unit[:, None], 1, 0)
-    seen = [c[:, None] for c in channels]
-    recording = Recording(seen, cameras, noise_variance=1.0, background=0.0)
+    captures = [c[:, None] for c in channels]
+    recording = Recording(captures, cameras, noise_variance=1.0, background=0.0)
     solver = AdmmTV(tau, iterations=iterations)
     result = solver.solve(recording, start=(start / unit)[:, None])
     return result.image.reshape(start.shape) * unit

@@ -53,7 +53,14 @@ def test_progress_and_files(run):
     images = {f"images/{m}--{t}mm.png" for m in ("conventional", "wiener") for t in (20, 45)}
     assert (
         files
-        == {".lock", "config.yaml", "metrics.json", "environment.json", "report.html"}
+        == {
+            ".lock",
+            "config.yaml",
+            "inputs.json",
+            "metrics.json",
+            "environment.json",
+            "report.html",
+        }
         | figures
         | {"figures/methods.png", "images/all-in-focus.png"}
         | images
