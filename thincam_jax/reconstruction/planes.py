@@ -18,7 +18,7 @@ from thincam_jax.reconstruction.uniform_light import high_passed, window_length
 _ALIKE = 0.95
 # Smooth misfit of measured PSFs relative to the light: shading, a pedestal, stray light. Where as
 # much is `_HIDDEN` times the noise or more, noise hides it, and low frequencies count in full.
-_SMOOTH, _HIDDEN = 0.03, 0.2
+_SMOOTH, _HIDDEN = 0.03, 0.1
 _FINEST = 0.25  # cycles/pixel; above it are the noise of measured PSFs and little light
 
 
@@ -61,7 +61,7 @@ def without_smooth_misfit(problem: InverseProblem) -> InverseProblem:
     .. math:: \eta = \frac{\sigma\,\|w\|}{\epsilon\,\mathrm{rms}(g)},\qquad
         \|w\| = \frac{1.5}{n + 1},\quad \epsilon = 0.03,
 
-    and hundreds of iterations become some 50. A capture with more noise (η > 0.2) stays as it is.
+    and hundreds of iterations become some 50. A capture with more noise (η > 0.1) stays as it is.
     """
     window, kept = 1.5 / (window_length(problem) + 1), []
     for weight, capture in zip(problem.weights, problem.captures, strict=True):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage as ndimage
@@ -12,6 +13,8 @@ import thincam_jax as tc
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction import TotalVariation, fringe_scanning
 from thincam_jax.reconstruction.depth import find_distances, refocus_sweep
+from thincam_jax.reconstruction.planes import without_smooth_misfit
+from thincam_jax.reconstruction.problem import misfit
 
 PLANES = (20.0, 45.0, 150.0)
 
@@ -96,6 +99,39 @@ def test_a_near_object_stays_near(brightness):
     light = np.asarray(image).sum(axis=(1, 2))
     assert light[0] > 0.85 * light.sum()
     assert light[3] < 0.05 * light.sum()
+
+
+def on_a_pedestal(recording, size):
+    """PSFs measured in uniform light, of `size` times their mean."""
+    psfs = np.asarray(recording.imaging_model.psfs)
+    psfs = psfs + size * psfs.mean(axis=(-2, -1), keepdims=True)
+    return replace(recording, imaging_model=tc.Psfs(psfs))
+
+
+@pytest.mark.thorough
+def test_a_pedestal_of_the_psfs_moves_no_light_to_the_far_plane():
+    """39 % stayed: a smaller shadow explained that the rest of the sensor is dark."""
+    recording = measured(1.0, 0, planes=2)
+    for size in (0.0, 0.2):
+        image = tc.reconstruct(on_a_pedestal(recording, size), tc.AdmmTV()).image
+        light = np.asarray(image).sum(axis=(1, 2))
+        assert light[0] > 0.8 * light.sum()
+
+
+def test_smooth_misfit_counts_less_where_it_exceeds_the_noise():
+    """The true image explains captures to some noise in spite of a pedestal; noisy ones stay."""
+    bright = on_a_pedestal(measured(2.0, 0, planes=2), 0.2).problem()
+    rows, columns = bright.image_shape[-2:]
+    image = np.zeros(bright.image_shape)
+    top, left = (rows - rig.FIELD[0] + 1) // 2, (columns - rig.FIELD[1] + 1) // 2
+    image[0, 0, top : top + rig.FIELD[0], left : left + rig.FIELD[1]] = rig.checks(
+        np.s_[14:34, 14:42], 6
+    )
+    filtered = without_smooth_misfit(bright)
+    image = jnp.asarray(image)
+    assert misfit(filtered, image) < 0.01 * misfit(bright, image)
+    noisy = measured(2.0, 0, planes=2, noise=0.03).problem()
+    assert without_smooth_misfit(noisy) is noisy
 
 
 SOLVERS = [
