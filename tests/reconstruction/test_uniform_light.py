@@ -246,7 +246,7 @@ def solve(capture, *, iterations=60, tolerance=0.0, **settings):
         model="geometric",
         pixel_integration=False,
     )
-    recording = tc.Recording(image, cameras, noise_variance=variance, valid=valid)
+    recording = tc.Recording(image, cameras, noise_variance=variance, valid=valid, background=0.0)
     return tc.reconstruct(
         recording, tc.AdmmTV(iterations=iterations, tolerance=tolerance), **settings
     )

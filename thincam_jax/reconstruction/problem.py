@@ -210,7 +210,7 @@ def weighted_mean(
 ) -> Float[Array, "..."]:
     """Mean over the last axes, which keep the length 1; 0 where all weights are."""
     last = tuple(range(-axes, 0))
-    whole = jnp.broadcast_to(weight, capture.shape)
+    whole = jnp.broadcast_to(weight, jnp.broadcast_shapes(weight.shape, capture.shape))
     total = jnp.sum(whole, axis=last, keepdims=True)
     return jnp.sum(whole * capture, axis=last, keepdims=True) / or_one(total)
 
