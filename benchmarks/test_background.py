@@ -1,4 +1,4 @@
-"""A background that nobody knows: AdmmTV with it found, beside AdmmTV of captures taken as they are.
+"""A background that nobody knows: AdmmTV with it found, beside AdmmTV that takes it for light.
 
 A photograph behind five cameras, 30 dB of noise, and a uniform background of 0, 10 and 50 % of each
 capture's mean. PSNR after the best gain and offset, after 30, 100 and 300 iterations; τ is the
