@@ -162,7 +162,8 @@ class PlugAndPlay(AbstractIterativeSolver):
         """Reconstruct; with a start image that is not dark s begins lower."""
         began = time.perf_counter()
         apart = TotalVariation(coupling="none")  # colours
-        problem = recording.problem(regulariser=apart, synthesis=self.synthesis)
+        # Data steps are linear, and so without a constraint.
+        problem = recording.problem(regulariser=apart, nonnegative=False, synthesis=self.synthesis)
         parts = _parts(problem)
         bright = 1.0 if starts_uniform(recording, problem) else 0.0
         images = [bright * uniform_image(part) for part in parts]

@@ -49,10 +49,10 @@ class InverseProblem(eqx.Module):
     - `tau`: τ ≥ 0, relative.
     - `regulariser`: R; default isotropic total variation.
     - `nonnegative`: whether to constrain f ≥ 0.
-    - `background`: "known", and subtracted; or each capture and channel has a uniform background
-      b_k that is "unknown", or "nonnegative". The least squares are then those of A_k f + b_k − g_k
-      with the best b_k for every f, the mean of what is missing by the weights w_k, or 0. Linear
-      methods take it without the constraint.
+    - `background`: "known" if the captures have none left. If "unknown", a uniform background b_k
+      of each capture and channel is added to A_k f: for every f the best one, the weighted mean of
+      g_k − A_k f. If "nonnegative", it is 0 where that mean is negative; linear methods ignore
+      this constraint.
 
     **Errors**: ValueError, one line, where operators and captures do not fit.
 

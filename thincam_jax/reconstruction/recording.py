@@ -63,8 +63,9 @@ class Recording(Module):
     - `background`: known light that is not the scene's, such as a black level or a dark frame: one
       for all captures, or one for each, that broadcasts to them. By default it is unknown behind
       `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
-      (but by `Wiener`, `FringeScanning` and `PoissonTV`), at no cost where there is none. It is
-      negative only in captures that are partly so. 0 with operators.
+      (but by `Wiener`, `FringeScanning` and `PoissonTV`). It is negative only in captures that are
+      partly so. Give 0 where there is none to `Ridge` of a dark room, which is otherwise some
+      0.6 dB worse. 0 with operators.
 
     **Errors**: ValueError, one line, for captures that do not fit the imaging model.
 
@@ -152,7 +153,7 @@ class Recording(Module):
             "tau": tau,
             "regulariser": regulariser,
             "nonnegative": nonnegative,
-            "background": self._kind_of_background(synthesis, nonnegative),
+            "background": self._kind_of_background(captures, synthesis, nonnegative),
         }
         operators = self._operators()
         if operators:
@@ -294,13 +295,12 @@ class Recording(Module):
             )
         return tuple(each)
 
-    def _kind_of_background(self, synthesis: Any, nonnegative: bool) -> Background:
+    def _kind_of_background(self, captures, synthesis: Any, nonnegative: bool) -> Background:
         """Not negative but in differences of captures, and if something was subtracted before."""
         if self.background is not None or isinstance(self.imaging_model, Stacked):
             return "known"
-        captures, _ = self._masked_captures()
-        light = [c for c in captures if not checks.is_traced(c)]
-        below = any(np.quantile(np.asarray(c), _DARKEST) < 0 for c in light)
+        known = [np.asarray(c) for c in captures if not checks.is_traced(c)]
+        below = any(np.mean(c < 0) > _DARKEST for c in known)
         mixed = synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))
         return "nonnegative" if nonnegative and not (below or mixed) else "unknown"
 

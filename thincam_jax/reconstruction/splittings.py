@@ -156,9 +156,9 @@ class FourierSplitting(AbstractSplitting):
         The minimum over z has the weights of `share` for the background.
         """
         seen = cut(q, operator.sensor_corner, operator.sensor_shape)
-        share, missing = weight / (weight + self.penalties.data), capture - seen
-        missing = -with_background(self.background, share, -missing, 2)
-        return place(share * missing, operator.sensor_corner, operator.window)
+        share = weight / (weight + self.penalties.data)
+        excess = with_background(self.background, share, seen - capture, 2)
+        return place(-share * excess, operator.sensor_corner, operator.window)
 
     def _images(self, spectrum) -> State:
         """K f of an image's spectrum."""

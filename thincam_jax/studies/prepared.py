@@ -24,7 +24,6 @@ from thincam_jax.reconstruction import (
     Psfs,
     Reconstruction,
     Recording,
-    Ridge,
     reconstruct,
 )
 from thincam_jax.reconstruction.iterate import Callback
@@ -163,7 +162,7 @@ class PreparedResult:
         """The least-squares problem that was solved."""
         if isinstance(self.solver, AbstractRegularised):
             return self.recording.problem(tau=self.solver.tau, regulariser=self.solver.prior)
-        return self.recording.problem(tau=2.0, nonnegative=not isinstance(self.solver, Ridge))
+        return self.recording.problem(tau=2.0, nonnegative=False)
 
     @property
     def facts(self) -> "PreparedFacts":

@@ -49,7 +49,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
         on.exit_code == 0
         and json.loads((tmp_path / "c/training.json").read_text("utf-8"))["steps"] == 4
     )
-    # Another network of the same name is not that which the training began with.
+    # A network of the same name with other content.
     kept = (out / NETWORK).read_bytes()
     (out / NETWORK).write_bytes((tmp_path / "c" / NETWORK).read_bytes())
     told = line(call(file, "--out", tmp_path / "c", *start, "--resume"))
