@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.checks import Number
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.learn.residual_noise import ResidualNoise, residual_noise
@@ -87,9 +86,8 @@ _TAU, _ITERATIONS, _TOLERANCE = 1.0, 100, 1e-3
 # s, relative to the first, that shows the noise of that image: dark rooms explain any noise with
 # more, and with less what total variation takes from planes at 40 dB counts as noise.
 _FITTED = 0.15
-# Error of a data step by conjugate gradients, as a part of the noise of Aᵀg; of a step that only
-# finds the noise and a start of `AdmmTV`.
-_STEP_ERROR, _PASSING_ERROR = 0.05, 0.3
+# Error of a data step by conjugate gradients, as a part of the noise of Aᵀg.
+_STEP_ERROR = 0.05
 # Least μ of the normal equations, in units of the precision's rounding, where ‖A‖ = 1: with less,
 # as of captures with over 45 dB in single precision, they are not solved, and images explode.
 _LEAST_SHIFT = 64
@@ -271,8 +269,7 @@ class _Run:
         self.largest = or_one(_FIRST * seen)
         self.course = course(self.solver.iterations, first)
         self.precision = self.given_precision
-        error = _PASSING_ERROR if kind == "passing" else _STEP_ERROR
-        self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]), error)
+        self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]))
         noise = self._noise()
         self.mistake = float(noise.mistake)
         weighted = kind != "passing" and bool(noise.grows)
@@ -336,12 +333,10 @@ class _Run:
         image = jnp.maximum(self.found, 0) if self.solver.nonnegative else self.found
         self.result = jnp.where(jnp.isfinite(image).all(), image * self.unit, self.result)
 
-    def _step(self, s: Float[Array, ""], error: float = _STEP_ERROR) -> None:
+    def _step(self, s: Float[Array, ""]) -> None:
         """`found`, z of a data step with s."""
         self.s, self.shift = s, shift_of(s, self.precision)
-        limit = jnp.asarray(error, s.dtype)  # an array, so that another one compiles nothing
-        z = data_step(self.normal, self.right, self.image, self.shift, self.precision, limit)
-        self.found = z
+        self.found = data_step(self.normal, self.right, self.image, self.shift, self.precision)
 
 
 def shift_of(s: Float[Array, ""], precision: Float[Array, ""]) -> Float[Array, ""]:
@@ -417,7 +412,6 @@ def data_step(
     image: Image,
     shift: Float[Array, ""],
     precision: Float[Array, ""],
-    error: Number = _STEP_ERROR,
 ) -> Image:
     """z; by conjugate gradients the change from f, up to a part of the noise of Aᵀg."""
     normal = normal.shifted(shift)
@@ -427,7 +421,7 @@ def data_step(
     noise = jnp.sqrt(jnp.mean(signs * (normal.applied(signs) - shift * signs)) / precision)
     change = right + shift * image - normal.applied(image)
     size = or_one(jnp.sqrt(jnp.mean(change**2)))
-    tolerance = jax.lax.stop_gradient(jnp.clip(error * noise / size, 1e-6, 0.1))
+    tolerance = jax.lax.stop_gradient(jnp.clip(_STEP_ERROR * noise / size, 1e-6, 0.1))
 
     def solved(_, right: Image) -> Image:
         return normal.solution(right, jnp.zeros_like(right), tolerance, INNER_STEPS).value
