@@ -190,6 +190,7 @@ def test_a_dark_field_larger_than_the_sensor_begins_with_total_variation():
     assert errors[0] < 1.01 * errors[1]
 
 
+@pytest.mark.thorough
 def test_total_variation_starts_from_the_data_step_unless_the_field_is_dark(monkeypatch):
     """Without `field_shape`: from a uniform image its low frequencies took 600 iterations."""
     starts, solve = [], tc.AdmmTV.solve
