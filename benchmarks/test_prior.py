@@ -329,7 +329,7 @@ def test_plug_and_play(name, capsys):
         pytest.skip(f"no photographs in {PHOTOGRAPHS}; set THINCAM_PHOTOGRAPHS")
     unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images[:COUNT]
     tuning = photographs(PHOTOGRAPHS / "cc0", SIDE).images[4:12:4]
-    drawn = [middle_square(sample_image("page"), SIDE), usaf1951((SIDE, SIDE), 2)]
+    drawn = [middle_square(sample_image("page", linear=True), SIDE), usaf1951((SIDE, SIDE), 2)]
     record, gains = CASES[name](), []
     for noise in NOISES:
         if noise.endswith("e") and name in ("FlatCam", "screen"):
