@@ -18,6 +18,7 @@ import tifffile
 from jaxtyping import Bool
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.files import open_regular
 from thincam_jax._core.image_files import (
     ImageFileError,
     kind_of,
@@ -28,13 +29,21 @@ from thincam_jax._core.image_files import (
 )
 from thincam_jax.imaging.encoding import ORIENTATION, upright
 from thincam_jax.measured.bayer import PATTERNS, turned_pattern
+from thincam_jax.measured.containers import OPENERS, read_array, read_pgm
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
 _Facts = dict[str, Any]
 
 # Raw files of cameras, most of which are TIFF with previews of their own.
 RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
-SUFFIXES = (".tif", ".tiff", ".png", ".npy", *RAW_SUFFIXES)
+SUFFIXES = (".tif", ".tiff", ".png", ".npy", ".pgm", ".ppm", ".fits", *RAW_SUFFIXES)
+_KEYED = re.compile(r"(?i)(.+\.(?:npz|mat|h5|hdf5|fits?)):(.+)")
+# By their first bytes, or those after a length: names, and what imageio is to read.
+_OTHERS = {
+    **{b"GIF8": ("a GIF", ", index=0"), b"BM": ("a BMP", ""), b"WEBP": ("a WebP", "")},
+    **{b"AVI ": ("an AVI film", ", index=0"), b"ftyp": ("an MP4 film or HEIF", ", index=0")},
+    **{b"jP  ": ("a JPEG 2000", ""), b"v/1\1": ("an OpenEXR", ""), b"8BPS": ("a PSD", "")},
+}
 # Photometric interpretations that hold counts: no palette, inverted scale or colour difference.
 _PLAIN = (
     tifffile.PHOTOMETRIC.MINISBLACK,
@@ -57,7 +66,9 @@ class NonlinearWarning(UserWarning):
 def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     """Read one image as it is stored, without scaling or gamma.
 
-    TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY. An opaque
+    TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY; PGM and PPM;
+    an array of NPZ, MATLAB, HDF5 or FITS, by its key as "file.mat:capture" where there are several.
+    An opaque
     alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is read with
     a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files of cameras
     need the extra `raw`; they give their mosaic (y, x) with the black level in it, and what the
@@ -170,8 +181,12 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Fa
 
     Facts: `bits` a sample, `orientation`, `bayer`, `black_level` and `white_level`, where known.
     """
+    named = _KEYED.fullmatch(str(path))
+    path, key = (Path(named[1]), named[2]) if named and not path.exists() else (path, None)
     kind = _kind(path)
-    readers = {
+    readers: dict[str, Any] = {
+        **{one: partial(_read_container, one, key) for one in OPENERS},
+        "pgm": read_pgm,
         "png": _read_png,
         "jpeg": _read_jpeg,
         "tiff": partial(_read_tiff, stack=stack),
@@ -196,6 +211,23 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Fa
     return images, kind, facts
 
 
+def _true_name(path: Path) -> str:
+    """What a file is that is not read, and the line of Python that brings it in."""
+    with open_regular(path) as (file, _):
+        start = file.read(12)
+    array = f"numpy.save({str(path.with_suffix('.npy'))!r}"
+    if path.suffix.lower() in (".raw", ".raw10", ".raw12", ".bin"):
+        given = f"measured.unpack_raw({str(path)!r}, (rows, columns), bits=10)"
+        return f"is packed counts without their size; {array}, {given})"
+    for first, (name, call) in _OTHERS.items():
+        if first in (start[: len(first)], start[4 : 4 + len(first)], start[8 : 8 + len(first)]):
+            return f"is {name}; {array}, imageio.v3.imread({str(path)!r}{call}))"
+    return (
+        "is not an image that can be read; give an undamaged TIFF, PNG, JPEG or NPY file, or "
+        f"{array}, pixels)"
+    )
+
+
 def _kind(path: Path) -> str:
     try:
         kind = kind_of(path)
@@ -207,10 +239,16 @@ def _kind(path: Path) -> str:
         raise CaptureFileError(f"{path}: cannot be read ({error.strerror or error})") from None
     if kind is not None and path.suffix.lower() in RAW_SUFFIXES:
         return "raw"
+    if kind is None:
+        raise CaptureFileError(f"{path}: {_true_name(path)}")
     if not kind:
-        what = "is not an image that can be read" if kind is None else "is empty or cut short"
-        raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG, JPEG or NPY file")
+        advice = "give an undamaged TIFF, PNG, JPEG or NPY file"
+        raise CaptureFileError(f"{path}: is empty or cut short; {advice}")
     return kind
+
+
+def _read_container(kind: str, key: str | None, data: bytes) -> tuple[list[np.ndarray], _Facts]:
+    return [read_array(kind, data, key)], {}
 
 
 def _read_npy(data: bytes) -> tuple[list[np.ndarray], _Facts]:
