@@ -15,7 +15,7 @@ import numpy as np
 
 ORIENTATION = 274  # tag of EXIF and TIFF
 _MOST_TAGS = 100  # of a profile
-_PARAMETERS = (1, 3, 4, 5, 7)  # of an ICC curve, by its kind
+_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}  # of an ICC curve, by its kind
 
 
 def decode_srgb(codes: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ def decoded(codes: np.ndarray, tags: Mapping[str, Any], photograph: bool) -> np.
       are sRGB, others are linear.
     """
     if profile := tags.get("icc_profile"):
-        with contextlib.suppress(struct.error, IndexError, ZeroDivisionError):
+        with contextlib.suppress(struct.error, KeyError):
             return _by_profile(codes, profile)
     if "srgb" in tags:
         return decode_srgb(codes)
@@ -57,7 +57,6 @@ def decoded(codes: np.ndarray, tags: Mapping[str, Any], photograph: bool) -> np.
 
 @functools.cache
 def say_once() -> None:
-    """Log that photographs are decoded, at the first of them."""
     logging.getLogger(__name__).info(
         "photographs of 8 bit are decoded from sRGB to linear light; linear=True leaves their codes"
     )
@@ -68,17 +67,15 @@ def _by_profile(codes: np.ndarray, profile: bytes) -> np.ndarray:
     (count,) = struct.unpack_from(">I", profile, 128)
     places = range(132, 132 + 12 * min(count, _MOST_TAGS), 12)
     tags = {profile[p : p + 4]: struct.unpack_from(">II", profile, p + 4) for p in places}
-    place, size = tags.get(b"rTRC") or tags.get(b"kTRC") or (0, 0)
+    place, size = tags[b"rTRC" if b"rTRC" in tags else b"kTRC"]
     curve = profile[place : place + size]
     if curve[:4] == b"curv":
         (count,) = struct.unpack_from(">I", curve, 8)
+        numbers = struct.unpack_from(f">{count}H", curve, 12)
         if count < 2:
-            return codes ** (struct.unpack_from(">H", curve, 12)[0] / 256) if count else codes
-        table = np.array(struct.unpack_from(f">{count}H", curve, 12)) / 65535
-        return np.interp(codes, np.linspace(0, 1, count), table)
-    if curve[:4] != b"para":
-        raise IndexError("no curve")
-    kind = struct.unpack_from(">H", curve, 8)[0]
+            return codes ** (numbers[0] / 256) if count else codes
+        return np.interp(codes, np.linspace(0, 1, count), np.array(numbers) / 65535)
+    kind = struct.unpack_from(">H", curve, 8)[0] if curve[:4] == b"para" else -1
     numbers = np.array(struct.unpack_from(f">{_PARAMETERS[kind]}i", curve, 12)) / 65536
     power, a, b, c, d, e, f = (*numbers, *(1, 0, 0, 0, 0, 0)[len(numbers) - 1 :])
     if kind in (1, 2):  # c is added on both sides of −b/a

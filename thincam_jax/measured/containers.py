@@ -11,6 +11,7 @@ import os
 import re
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,8 @@ def _open_npz(data: bytes, opened: contextlib.ExitStack) -> _Arrays:
 def _open_matlab(data: bytes, _: contextlib.ExitStack) -> _Arrays:
     stream, names = io.BytesIO(data), ("char", "cell", "struct", "object", "function", "opaque")
     found = [(n, shape) for n, shape, kind in scipy.io.whosmat(stream) if kind not in names]
-    return {n: (8 * math.prod(shape), lambda n=n: _variable(data, n)) for n, shape in found}
-
-
-def _variable(data: bytes, name: str) -> Any:
-    return scipy.io.loadmat(io.BytesIO(data), variable_names=[name])[name]
+    load = partial(scipy.io.loadmat, stream)
+    return {n: (8 * math.prod(s), lambda n=n: load(variable_names=[n])[n]) for n, s in found}
 
 
 def _open_hdf5(data: bytes, opened: contextlib.ExitStack, transposed: bool = False) -> _Arrays:

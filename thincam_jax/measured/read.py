@@ -32,7 +32,7 @@ from thincam_jax.measured.bayer import PATTERNS, turned_pattern
 from thincam_jax.measured.containers import OPENERS, read_array, read_pgm
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
-_Facts = dict[str, Any]
+_Facts = dict[str, Any]  # bits, orientation, and those of `Raw`, where a file says them
 
 # Raw files of cameras, most of which are TIFF with previews of their own.
 RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
@@ -68,12 +68,11 @@ def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
 
     TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY; PGM and PPM;
     an array of NPZ, MATLAB, HDF5 or FITS, by its key as "file.mat:capture" where there are several.
-    An opaque
-    alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is read with
-    a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files of cameras
-    need the extra `raw`; they give their mosaic (y, x) with the black level in it, and what the
-    file says of it: pattern, black and white level. Images are turned upright, and their pattern
-    with them, as their orientation (EXIF, TIFF) says. NaN are dead pixels.
+    An opaque alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is
+    read with a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files
+    of cameras need the extra `raw`; they give their mosaic (y, x) with the black level in it, and
+    what the file says of it: pattern, black and white level. Images are turned upright, and their
+    pattern with them, as their orientation (EXIF, TIFF) says. NaN are dead pixels.
 
     **Errors**: CaptureFileError, one line, for a file that is missing, truncated, damaged or no
     image, for a stack of images, and for everything that `Raw` refuses.
@@ -121,13 +120,13 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
 
     **Errors**: CaptureFileError as in `read_image`.
     """
-    (pixels,), _, _ = _decode(Path(path))
+    (pixels,), _, facts = _decode(Path(path))
     if pixels.ndim != 2 or pixels.size == 0 or pixels.dtype.kind not in "buif":
         raise CaptureFileError(
             f"{path}: holds {pixels.dtype} values of shape {pixels.shape}; give a map (y, x) that "
             "is zero for all pixels but the marked ones"
         )
-    return pixels != 0
+    return upright(pixels, facts.get("orientation", 1)) != 0
 
 
 @checked
@@ -177,10 +176,7 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Facts]:
-    """Pixels of each image, format, and facts of the file; several images only of a stack.
-
-    Facts: `bits` a sample, `orientation`, `bayer`, `black_level` and `white_level`, where known.
-    """
+    """Pixels of each image, format, and facts of the file; several images only of a stack."""
     named = _KEYED.fullmatch(str(path))
     path, key = (Path(named[1]), named[2]) if named and not path.exists() else (path, None)
     kind = _kind(path)

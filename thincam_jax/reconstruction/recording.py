@@ -124,8 +124,8 @@ class Recording(Module):
         self.imaging_model = imaging_model
         if not isinstance(captures, list | tuple) and np.ndim(captures) == 0:
             raise TypeError(f"captures is {checks.shown(captures)}; give an array for each camera")
-        arrays, known = without_unknown(captures)
-        self.captures = tuple(as_real(c) for c in arrays)
+        pairs = [without_unknown(capture) for capture in captures]
+        self.captures, known = tuple(as_real(c) for c, _ in pairs), [one for _, one in pairs]
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
         self.background = None if background is None else self._backgrounds(background)
