@@ -16,6 +16,7 @@ from thincam_jax.imaging.display import eight_bit, png_bytes
 from thincam_jax.imaging.encoding import decode_srgb, encode_srgb, upright
 
 CODES = np.random.default_rng(0).integers(0, 256, (9, 14), dtype=np.uint8)
+CODES[0, :2] = 0, 255
 LIGHT = decode_srgb(CODES / 255)
 
 
@@ -62,6 +63,7 @@ CURVES = {
     "power": (b"curv" + bytes(4) + struct.pack(">IH", 1, 512), lambda x: x**2),
     "table": (b"curv" + bytes(4) + struct.pack(">I3H", 3, 0, 13107, 65535), None),
     "srgb": (b"para" + bytes(4) + struct.pack(">HH", 3, 0) + fixed(*SRGB), decode_srgb),
+    "endless": (b"para" + bytes(4) + struct.pack(">HH", 0, 0) + fixed(-2.0), decode_srgb),
     "damaged": (b"para" + bytes(4) + struct.pack(">HH", 900, 0), decode_srgb),
 }
 

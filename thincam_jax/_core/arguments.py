@@ -80,11 +80,10 @@ def checked(public: _Public) -> _Public:
 
 def _native(allowed: _Kinds | None, value: Any) -> Any:
     """An array of another library, or a masked one, as one of NumPy where its kind is checked."""
-    foreign = checks.is_foreign(value) or isinstance(value, np.ma.MaskedArray)
-    if not (allowed and foreign):
+    if not allowed or not (checks.is_foreign(value) or isinstance(value, np.ma.MaskedArray)):
         return value
-    masked = isinstance(value, np.ma.MaskedArray)
-    return checks.native(value) if masked or not any(k.holds(value) for k in allowed) else value
+    kept = checks.is_foreign(value) and any(kind.holds(value) for kind in allowed)
+    return value if kept else checks.native(value)
 
 
 def _refuse_unsound(name: str, value: Any) -> None:

@@ -44,8 +44,10 @@ def decoded(codes: np.ndarray, tags: Mapping[str, Any], photograph: bool) -> np.
       are sRGB, others are linear.
     """
     if profile := tags.get("icc_profile"):
-        with contextlib.suppress(struct.error, KeyError):
-            return _by_profile(codes, profile)
+        with contextlib.suppress(struct.error, KeyError), np.errstate(all="ignore"):
+            light = _by_profile(codes, profile)
+            if np.isfinite(light).all():
+                return np.clip(light, 0, 1)
     if "srgb" in tags:
         return decode_srgb(codes)
     if gamma := tags.get("gamma"):

@@ -85,11 +85,8 @@ def _library(name: str, package: str) -> Any:
 
 
 OPENERS = {
-    "npz": _open_npz,
-    "mat": _open_matlab,
-    "hdf5": _open_hdf5,
-    "mat73": lambda data, opened: _open_hdf5(data, opened, transposed=True),
-    "fits": _open_fits,
+    **{"npz": _open_npz, "mat": _open_matlab, "hdf5": _open_hdf5, "fits": _open_fits},
+    "mat73": partial(_open_hdf5, transposed=True),
 }
 
 

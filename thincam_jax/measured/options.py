@@ -112,11 +112,9 @@ def by_files(
     psf_background: Any = None,
     dead: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Arguments of `prepare` for two images, with what their files say where nothing is given.
+    """Arguments of `prepare`, by the files where nothing is given: pattern, black levels.
 
-    Pattern, black levels as backgrounds, and dead pixels, which join those that are given.
-
-    **Errors**: MeasurementError for files that contradict each other.
+    Dead pixels join those that are given. **Errors**: MeasurementError for two patterns.
     """
     options = options or Preparation()
     stated = dict.fromkeys(raw.bayer for raw in (capture, psf) if raw.bayer)
@@ -133,8 +131,8 @@ def by_files(
     for raw in (capture, psf):
         if raw.dead is not None and raw.dead.shape == capture.pixels.shape[:2]:
             dead = raw.dead if dead is None else dead | raw.dead
-    given = {"background": background, "options": options}
-    return given | {"psf_background": psf_background, "dead": dead}
+    names = "background", "options", "psf_background", "dead"
+    return dict(zip(names, (background, options, psf_background, dead), strict=True))
 
 
 def _check_file(name: str, raw: Raw, background: Any, dead: Any, options: Preparation) -> None:

@@ -12,6 +12,7 @@ from thincam_jax._core.files import MeasurementError
 from thincam_jax.measured.bayer import Pattern
 
 MAX_CHANNELS = 4
+_LOGGER = logging.getLogger(__name__)
 
 
 class CaptureFileError(MeasurementError):
@@ -63,11 +64,9 @@ class Raw:
         if dead.any():
             pixels = np.where(dead, 0, pixels).astype(pixels.dtype)
             dead = dead if dead.ndim == 2 else dead.any(axis=2)
-            known = dead if self.dead is None else dead | self.dead
-            object.__setattr__(self, "dead", known)
-            logger = logging.getLogger(__name__)
-            logger.warning("%s: %d pixels are NaN or masked: taken as dead", self.name, dead.sum())
-        bad = np.count_nonzero(np.isinf(pixels)) if pixels.dtype.kind == "f" else 0
+            object.__setattr__(self, "dead", dead if self.dead is None else dead | self.dead)
+            _LOGGER.warning("%s: %d pixels are NaN or masked: taken as dead", self.name, dead.sum())
+        bad = int(np.isinf(pixels).sum()) if pixels.dtype.kind == "f" else 0
         if bad or (self.dead is not None and self.dead.all()):
             raise MeasurementError(
                 f"{self.name}: {bad or pixels.size} of {pixels.size} values are NaN or infinite; "

@@ -51,6 +51,7 @@ _PLAIN = (
     tifffile.PHOTOMETRIC.CFA,
     tifffile.PHOTOMETRIC.LINEAR_RAW,
 )
+_UNDAMAGED = "give an undamaged TIFF, PNG, JPEG or NPY file"
 _FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  # orientations by LibRaw
 _NONLINEAR = (
     "a JPEG's counts are not in proportion to the light (gamma, tone curve, compression), so that "
@@ -218,10 +219,7 @@ def _true_name(path: Path) -> str:
     for first, (name, call) in _OTHERS.items():
         if first in (start[: len(first)], start[4 : 4 + len(first)], start[8 : 8 + len(first)]):
             return f"is {name}; {array}, imageio.v3.imread({str(path)!r}{call}))"
-    return (
-        "is not an image that can be read; give an undamaged TIFF, PNG, JPEG or NPY file, or "
-        f"{array}, pixels)"
-    )
+    return f"is not an image that can be read; {_UNDAMAGED}, or {array}, pixels)"
 
 
 def _kind(path: Path) -> str:
@@ -238,8 +236,7 @@ def _kind(path: Path) -> str:
     if kind is None:
         raise CaptureFileError(f"{path}: {_true_name(path)}")
     if not kind:
-        advice = "give an undamaged TIFF, PNG, JPEG or NPY file"
-        raise CaptureFileError(f"{path}: is empty or cut short; {advice}")
+        raise CaptureFileError(f"{path}: is empty or cut short; {_UNDAMAGED}")
     return kind
 
 
@@ -294,16 +291,19 @@ def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
         pixels = file.raw_image_visible.copy()
         if pixels.ndim != 2:
             raise CaptureFileError("holds colours, no mosaic; save it as TIFF")
-        white = int(file.white_level)
-        facts: _Facts = {"bits": max(8, white.bit_length()), "orientation": _FLIPS[file.sizes.flip]}
-        if white < 2**16 - 1:  # which may stand for none
-            facts["white_level"] = white
-        facts["black_level"] = float(np.mean(file.black_level_per_channel))
         letters = file.color_desc.decode("ascii", "replace")
-        sites = "".join(letters[n] for n in file.raw_colors_visible[:2, :2].ravel())
-        if sites in PATTERNS and np.asarray(file.raw_pattern).size == 4:
-            facts["bayer"] = sites
-        return [pixels], facts
+        sites = [letters[n] for n in file.raw_colors_visible[:2, :2].ravel()]
+        sites = "".join(sites) if np.asarray(file.raw_pattern).size == 4 else ""
+        facts = _sensor_facts(sites, file.black_level_per_channel, [int(file.white_level)])
+        return [pixels], {"bits": 16, **facts, "orientation": _FLIPS[file.sizes.flip]}
+
+
+def _sensor_facts(sites: str, black: Any, white: Any) -> _Facts:
+    facts: _Facts = {"bayer": sites} if sites in PATTERNS else {}
+    facts |= {"black_level": float(np.mean(black))} if len(black) in (1, 4) else {}
+    if len(white) == 0 or white[0] >= 2**16 - 1:  # which may stand for none
+        return facts
+    return facts | {"white_level": int(white[0]), "bits": max(8, int(white[0]).bit_length())}
 
 
 def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], _Facts]:
@@ -327,11 +327,8 @@ def _tiff_facts(page: tifffile.TiffPage) -> _Facts:
     if page.photometric != tifffile.PHOTOMETRIC.CFA:
         return facts
     sites = "".join("RGB???"[min(n, 5)] for n in bytes(page.tags.valueof(33422, b"")))
-    facts |= {"bayer": sites} if sites in PATTERNS else {}
     black, white = (np.ravel(page.tags.valueof(tag, [])) for tag in (50714, 50717))
-    if len(white) and white[0] < 2**16 - 1:
-        facts |= {"white_level": int(white[0]), "bits": max(8, int(white[0]).bit_length())}
-    return facts | ({"black_level": float(np.mean(black))} if len(black) in (1, 4) else {})
+    return facts | _sensor_facts(sites, black, white)
 
 
 def _read_page(page: tifffile.TiffPage) -> np.ndarray:
