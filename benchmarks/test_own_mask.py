@@ -28,7 +28,7 @@ Image.fromarray((255 * cells).astype(np.uint8)).save("{folder}/mask.png")
 mask = tc.read_mask("{folder}/mask.png", 12 * um)
 camera = tc.LenslessCamera(mask, tc.Sensor((512, 512), 12 * um), 2.0)
 light = {{"wavelength": 550 * nm, "object_distance": 250.0}}
-scene = tc.Scene(tc.ImagePlane(sample_image("camera"), 250.0, width=180.0), 550 * nm)
+scene = tc.Scene(tc.ImagePlane(sample_image("camera", linear=True), 250.0, width=180.0), 550 * nm)
 noise = tc.GaussianNoise(snr_db=40.0)
 
 

@@ -363,7 +363,7 @@ def test_plug_and_play(name, capsys):
     side = 256 if name == "default field" else SIDE
     unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", side).images[:COUNT]
     tuning = photographs(PHOTOGRAPHS / "cc0", side).images[4:12:4]
-    page = middle_square(sample_image("page"), SIDE)
+    page = middle_square(sample_image("page", linear=True), SIDE)
     drawn = [page if side == SIDE else resize(page, (side, side)), usaf1951((side, side), 2)]
     record, gains = CASES[name](), []
     for noise in NOISES:

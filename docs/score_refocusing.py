@@ -360,7 +360,7 @@ def picture(methods: Methods) -> None:
     """A photograph, a page of text, and one before the other; what the methods make of them."""
     camera = methods.camera
     clock, page = (
-        resize(middle_square(sample_image(name), 256), camera.field_shape)
+        resize(middle_square(sample_image(name, linear=True), 256), camera.field_shape)
         for name in ("clock", "page")
     )
     both = two_planes(camera, (page, clock), rectangle(camera.field_shape, 3), 800)

@@ -63,7 +63,9 @@ figure.savefig(FIGURES / "fit.png", dpi=100)
 #
 # A capture of the true camera, reconstructed as if it were the drawing's, and with the fitted one.
 
-plane = tc.ImagePlane(sample_image("chelsea").mean(axis=-1), distance=250.0, width=120.0)
+plane = tc.ImagePlane(
+    sample_image("chelsea", linear=True).mean(axis=-1), distance=250.0, width=120.0
+)
 capture = tc.capture(true, tc.Scene(plane, 500 * nm), key=0, noise=tc.GaussianNoise(snr_db=40.0))
 field_shape = tuple(round(float(side) * 6.62 / 250 / pitch) for side in (plane.height, plane.width))
 solver, found = tc.AdmmTV(tau=1.0, iterations=50 if SMALL else 300), {}

@@ -40,7 +40,7 @@ cameras = [
     for phase in phases
 ]
 side = 2 * round(130 * 6.5 / 250 / pitch / 2)
-photograph = sample_image("astronaut")
+photograph = sample_image("astronaut", linear=True)
 truth = np.stack([resize(photograph[..., k], (side, side)) for k in range(3)])
 models = [
     tc.Cameras(cameras, wavelength=light, object_distance=250.0, field_shape=(side, side))

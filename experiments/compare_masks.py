@@ -93,14 +93,14 @@ masks["pinhole"] = ComparedMask((tc.Pinhole(48 * um),), "pinhole")
 # mask pays for what it blocks; read noise is 3 electrons. The τ of total variation is, for each
 # mask and light, the best of five on another scene.
 
-page = sample_image("page")
+page = sample_image("page", linear=True)
 page = middle_square(page, round(0.7 * min(page.shape)))
 scenes = {
-    "photograph": ComparedScene.of_picture(sample_image("camera"), field),
+    "photograph": ComparedScene.of_picture(sample_image("camera", linear=True), field),
     "text": ComparedScene.of_picture(page, field),
     "points": ComparedScene.of_picture(point_grid(field, (9, 9)), field, "flat"),
 }
-astronaut = ComparedScene.of_picture(sample_image("astronaut"), field)
+astronaut = ComparedScene.of_picture(sample_image("astronaut", linear=True), field)
 tuning = Tuning(astronaut, *{"full": ((0.25, 0.5, 1, 2, 4), 60), "small": ((1,), 30)}[SIZE])
 comparison = MaskComparison(
     setting,

@@ -111,7 +111,7 @@ figure.savefig(FIGURES / "psf.png", dpi=110)
 # × 5 tiles, and a photograph. For comparison, the same captures with the PSF of the axis.
 
 chart = np.tile(usaf1951((field // 5 * 3,) * 2), (5, 5))
-photograph = sample_image("chelsea").mean(axis=-1)[:, 75:375]
+photograph = sample_image("chelsea", linear=True).mean(axis=-1)[:, 75:375]
 pictures = np.stack([chart, resize(photograph, chart.shape)])
 plane = tc.ImagePlane(pictures, distance=object_distance, width=object_width)
 scene = tc.Scene(plane, 500 * nm)

@@ -95,7 +95,7 @@ along = {model: tc.psf(line, model=model, **light)[0] for model in models}
 # shot noise follows from the electrons that this makes. `tc.capture` convolves the scene, turned
 # over and scaled by d/t as a pinhole does (Eq 3.6), with the PSF (Eq 3.8) and crops to the sensor.
 
-picture = sample_image("chelsea").mean(axis=-1)
+picture = sample_image("chelsea", linear=True).mean(axis=-1)
 plane = tc.ImagePlane(picture, distance=250.0, width=0.8 * width * 250.0 / 6.5)
 scene = tc.Scene(plane, 500 * nm)
 noise = tc.PoissonGaussianNoise(read_noise=8.0 * blocks)

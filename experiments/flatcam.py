@@ -53,7 +53,7 @@ def scene(image, distance, light=colours):
     return tc.Scene(tc.ImagePlane(image, distance=object_distance, width=width), light)
 
 
-photograph = resize(sample_image("camera")[40:328, 130:514], scene_shape)
+photograph = resize(sample_image("camera", linear=True)[40:328, 130:514], scene_shape)
 
 # %%
 # Terms

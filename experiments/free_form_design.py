@@ -183,7 +183,7 @@ def search(error, draw, steps, electrons):
 
 
 def photograph(name):
-    image = np.atleast_3d(sample_image(name)).mean(-1)
+    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
     high, wide = (round(min(np.divide(image.shape, field)) * n) for n in field)
     top, left = (image.shape[0] - high) // 2, (image.shape[1] - wide) // 2
     image = resize(image[top : top + high, left : left + wide], (2 * field[0], 2 * field[1]))

@@ -244,7 +244,7 @@ figure.savefig(FIGURES / "light.png", dpi=110)
 
 
 def photograph(name):
-    whole = sample_image(name).astype(float)
+    whole = sample_image(name, linear=True).astype(float)
     whole = whole if whole.ndim == 2 else whole.mean(axis=-1)
     side = min(whole.shape)
     return resize(whole[:side, :side], (120, 120))

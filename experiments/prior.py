@@ -41,7 +41,7 @@ mask = tc.ModifiedUniformlyRedundantArray(order, cell=0.18 * 31 / order)
 camera = tc.LenslessCamera(mask, tc.Sensor((pixels, pixels), pitch), distance=distance)
 light = {"wavelength": 550 * nm, "object_distance": depth}
 field = round(0.6 * pixels)  # pixels of the reconstructions
-picture = resize(sample_image("camera"), (side, side))
+picture = resize(sample_image("camera", linear=True), (side, side))
 
 
 def on_plane(picture):
@@ -123,7 +123,7 @@ figure.savefig(FIGURES / "psnr.png", dpi=110)
 # signal of above letters become strokes and tissue smooth blots, as believable as the right
 # ones. Total variation, here with τ = 1, has patches, which nobody takes for detail.
 
-pictures = {name: sample_image(name) for name in ("page", "immunohistochemistry")}
+pictures = {name: sample_image(name, linear=True) for name in ("page", "immunohistochemistry")}
 figure, axes = plt.subplots(2, 3, figsize=(9, 6.2), layout="constrained")
 for row, (name, whole) in zip(axes, pictures.items(), strict=True):
     grey = np.atleast_3d(whole).mean(axis=2)

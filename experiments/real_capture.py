@@ -51,7 +51,7 @@ if hand := os.environ.get("THINCAM_HAND"):
 else:
     shape, pitch = ((160, 200), 12 * um) if SMALL else ((480, 600), 4 * um)
     camera = tc.LenslessCamera(tc.random_cells(0, 1.2, 60 * um), tc.Sensor(shape, pitch), 2.0)
-    picture = np.moveaxis(sample_image("chelsea"), -1, 0)
+    picture = np.moveaxis(sample_image("chelsea", linear=True), -1, 0)
     planes = [tc.ImagePlane(colour, distance=250.0, width=240.0) for colour in picture]
     light = [610 * nm, 540 * nm, 460 * nm]
     views = [tc.capture(camera, tc.Scene(p, w)) for p, w in zip(planes, light, strict=True)]

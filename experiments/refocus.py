@@ -33,7 +33,7 @@ phases = [n * math.pi / 2 for n in range(4)]
 masks = [tc.FresnelZoneAperture(40.0 * PART, phase, width=5.6 / PART) for phase in phases]
 cameras = [tc.LenslessCamera(mask, sensor, distance=6.5) for mask in masks]
 near, far = 80.0 / PART, 140.0 / PART
-picture = sample_image("astronaut").mean(axis=-1)
+picture = sample_image("astronaut", linear=True).mean(axis=-1)
 left = np.arange(picture.shape[1]) < picture.shape[1] // 2
 scene = tc.Scene(
     [

@@ -57,7 +57,7 @@ def capture(picture, distance, seed):
 # picture that is predicted best from its own pixels, as in lossless compression. A blank wall has
 # no ghosts to tell: its status says so, and the distances that it does not exclude are all.
 
-person = resize(sample_image("camera"), (cells, cells))
+person = resize(sample_image("camera", linear=True), (cells, cells))
 scenes = {f"{distance:g} mm": (person, distance) for distance in (300.0, 550.0, 900.0)}
 scenes["blank wall"] = (np.ones((cells, cells)), 550.0)
 captures, found = {}, {}

@@ -49,7 +49,7 @@ shape, pitch, side, electrons = {
 # the devices.
 
 display_pitch, distance, wavelength = 36 * um, 6.5, 532 * nm
-picture = sample_image("astronaut").mean(axis=-1)
+picture = sample_image("astronaut", linear=True).mean(axis=-1)
 scene = tc.Scene(tc.ImagePlane(picture, distance=250.0, width=130.0), wavelength)
 electronics = Electronics()
 virtual = None

@@ -202,7 +202,7 @@ figure.savefig(FIGURES / "precision.png", dpi=110)
 
 shape, pitch = {"full": ((256, 320), 17 * um), "small": ((96, 128), 44 * um)}[SIZE]
 names = ("astronaut", "brick", "camera", "cat", "coffee", "coins", "moon", "rocket")
-pictures = [np.atleast_3d(sample_image(name)).mean(axis=-1) for name in names]
+pictures = [np.atleast_3d(sample_image(name, linear=True)).mean(axis=-1) for name in names]
 planes = [
     tc.ImagePlane(resize(picture, (60, 80)), distance, width=0.2 * distance)
     for picture, distance in zip(pictures, np.geomspace(100.0, 10_000.0, 8), strict=True)

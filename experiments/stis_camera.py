@@ -199,7 +199,7 @@ def models(mask_psf, object_distance):
     return found, level
 
 
-pictures = [sample_image("camera"), sample_image("page")[:180, :180]]
+pictures = [sample_image("camera", linear=True), sample_image("page", linear=True)[:180, :180]]
 # The first image is upside down, as behind every mask.
 scenes = jnp.asarray(np.stack([resize(p, field) for p in pictures])[:, ::-1, ::-1], jnp.float32)
 

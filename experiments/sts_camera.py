@@ -140,8 +140,8 @@ figure.savefig(FIGURES / "smear.png", dpi=110)
 
 plane = wg.ObjectPlane((64, 64), distance, 150.0, (0.0, 27.0))
 system = wg.system_operator(camera, plane, orders)
-scenes = {"camera": resize(sample_image("camera"), (64, 64))}
-scenes["text"] = resize(sample_image("page")[:180, :180], (64, 64))
+scenes = {"camera": resize(sample_image("camera", linear=True), (64, 64))}
+scenes["text"] = resize(sample_image("page", linear=True)[:180, :180], (64, 64))
 models = {
     "right model": system,
     "glass 2 % thicker": wg.system_operator(see_through(5.1), plane, orders),
@@ -201,7 +201,7 @@ bands = [wg.ColourBand(centre, 80 * nm) for centre in (610 * nm, 535 * nm, 465 *
 colour = wg.ColourCamera(cameras, bands)
 cells = wg.ObjectPlane((24, 24), distance, 150.0, (0.0, 27.0))
 mixed, separated = (wg.colour_system(colour, cells, orders, 4, kind) for kind in ("all", "none"))
-face = np.moveaxis(resize(sample_image("astronaut"), (24, 24)), -1, 0)[:, None]
+face = np.moveaxis(resize(sample_image("astronaut", linear=True), (24, 24)), -1, 0)[:, None]
 clean = mixed(jnp.asarray(face, jnp.float32))
 deviation = float(jnp.sqrt(jnp.mean(clean**2))) * 10 ** (-40 / 20)
 seen = clean + deviation * jax.random.normal(jax.random.key(2), clean.shape)

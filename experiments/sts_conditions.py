@@ -45,7 +45,7 @@ CROPS = {"coins": 0.7, "astronaut": 1.0, "camera": 1.0, "clock": 0.9, "page": 0.
 def pictures(count, grey_edges=False):
     drawn = [siemens_star((256, 256))]
     for name, crop in CROPS.items():
-        photograph = np.atleast_3d(sample_image(name)).mean(axis=-1)
+        photograph = np.atleast_3d(sample_image(name, linear=True)).mean(axis=-1)
         drawn.append(middle_square(photograph, round(crop * min(photograph.shape))))
     small = np.stack([resize(one, (count, count)) for one in drawn])
     for number, fine in enumerate(drawn[:3]):

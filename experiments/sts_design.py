@@ -123,8 +123,8 @@ figure.savefig(FIGURES / "slices.png", dpi=110)
 # Captures with four ghosts and their smear, read with the shot noise of the plate's own light, and
 # reconstructed by ADMM with total variation.
 
-page = sample_image("page")
-pictures = {"camera": sample_image("camera")}
+page = sample_image("page", linear=True)
+pictures = {"camera": sample_image("camera", linear=True)}
 pictures["text"] = middle_square(page, round(0.94 * min(page.shape)))
 scenes = {name: resize(picture, cells) for name, picture in pictures.items()}
 solver = tc.AdmmTV(0.5, iterations=50) if full else tc.Ridge(1.0)

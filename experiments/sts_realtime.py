@@ -56,7 +56,7 @@ noise = np.float32(1e-3 * model.max())
 measured = noise * rng.standard_normal(model.shape, dtype=np.float32)
 np.add.at(measured, where, np.asarray(rays.values))
 
-photograph = resize(sample_image("camera"), (cells + count, cells + count))
+photograph = resize(sample_image("camera", linear=True), (cells + count, cells + count))
 scenes = [jnp.asarray(photograph[k : k + cells, k : k + cells], jnp.float32) for k in range(count)]
 clean = [rays(scene) for scene in scenes]
 deviation = float(jnp.sqrt(jnp.mean(clean[0] ** 2))) * 10 ** (-30 / 20)

@@ -171,7 +171,9 @@ def middle(image):
     return image[top : top + side, left : left + side].mean(axis=-1)
 
 
-photographs = [middle(sample_image(name)) for name in ("astronaut", "chelsea", "coffee")]
+photographs = [
+    middle(sample_image(name, linear=True)) for name in ("astronaut", "chelsea", "coffee")
+]
 pictures = [usaf1951((count, count)), *(resize(p, (count, count)) for p in photographs)]
 plane = tc.ImagePlane(np.stack(pictures), distance=250.0, width=object_width)
 scene = tc.Scene(plane, 500 * nm)

@@ -51,7 +51,7 @@ def seen(camera, scenes):
 def windows(name, speed):
     """The last one is the same at every speed."""
     size = count, count + speeds[-1] * length
-    photograph = np.asarray(resize(sample_image(name), size), np.float32)
+    photograph = np.asarray(resize(sample_image(name, linear=True), size), np.float32)
     return np.stack([photograph[:, speed * k :][:, :count] for k in range(length)][::-1])
 
 

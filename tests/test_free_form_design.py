@@ -35,7 +35,7 @@ def zone_plate(beta, phase):
 
 
 def photograph(name):
-    image = np.atleast_3d(sample_image(name)).mean(-1)
+    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
     high, wide = (
         round(min(image.shape[0] / FIELD[0], image.shape[1] / FIELD[1]) * n) for n in FIELD
     )

@@ -123,6 +123,7 @@ def test_the_core_runs_without_any_extra(tmp_path):
         "dask",
         "distributed",
         "gdstk",
+        "h5py",
         "imagecodecs",
         "pyarrow",
         "rawpy",

@@ -133,7 +133,7 @@ def test_whole_files_are_read(tmp_path, name):
     content, pixels = WHOLE[name]
     (tmp_path / name).write_bytes(content)
     np.testing.assert_array_equal(read_image(tmp_path / name).pixels, pixels)
-    np.testing.assert_array_equal(tc.load_image(tmp_path / name), pixels / 255)
+    np.testing.assert_array_equal(tc.load_image(tmp_path / name, linear=True), pixels / 255)
 
 
 def test_whole_lossy_files_are_read(tmp_path):

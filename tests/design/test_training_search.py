@@ -33,7 +33,7 @@ KEY = jax.random.key(3)
 
 def training(pixels=32):
     space = small.problem().space
-    given = [sample_image("camera")], space, small.setup(), phase_pairs(2)
+    given = [sample_image("camera", linear=True)], space, small.setup(), phase_pairs(2)
     return build_training(*given, pixels=pixels, key=KEY)
 
 

@@ -108,7 +108,7 @@ def test_captures_of_little_noise_are_solved_in_single_precision():
     y, x = np.indices((63, 63)) - 31
     psf = np.float32((1 + np.cos(0.02 * (y**2 + x**2))) * (np.hypot(y, x) < 31))
     A = CropConvolution(jnp.asarray(psf / psf.sum()), 1.0, (32, 32), (32, 32))
-    truth = np.float32(resize(sample_image("camera"), (32, 32)))
+    truth = np.float32(resize(sample_image("camera", linear=True), (32, 32)))
     capture = np.asarray(A(jnp.asarray(truth)))
     deviation = np.float32(capture.std() * 10 ** (-52 / 20))
     noise = deviation * np.random.default_rng(0).standard_normal(capture.shape, np.float32)
@@ -174,7 +174,7 @@ def dark_field(noise: float):
     psf = (1 + np.cos(0.04 * (y**2 + x**2))) * (abs(y) < 24) * (abs(x) < 26) / 600
     A = CropConvolution(jnp.asarray(psf, jnp.float32), 1.0, sensor, field)
     truth = np.zeros(field, np.float32)
-    truth[32:64, 34:68] = resize(sample_image("camera"), (32, 34))
+    truth[32:64, 34:68] = resize(sample_image("camera", linear=True), (32, 34))
     capture = np.asarray(A(jnp.asarray(truth)))
     noise = noise * capture.std()
     return truth, capture + noise * rng.standard_normal(sensor, np.float32), noise, A
@@ -230,7 +230,7 @@ def test_planes_told_half_of_their_noise_begin_as_smooth():
     mask, sensor = tc.FresnelZoneAperture(40.0, width=1.4), tc.Sensor((64, 72), 0.04)
     camera, distances = tc.LenslessCamera(mask, sensor, 5.0), (40.0, 120.0)
     model = tc.Cameras([camera], wavelength=5e-4, object_distance=distances, field_shape=(24, 28))
-    picture = np.float32(resize(sample_image("camera"), (24, 28)))
+    picture = np.float32(resize(sample_image("camera", linear=True), (24, 28)))
     near = np.indices((24, 28))[1] < 14
     truth = np.stack([picture * near, picture * ~near])
     blank = tc.Recording([np.zeros(sensor.shape, np.float32)], model).problem()

@@ -42,7 +42,7 @@ def zone_aperture(share: float = 1.0):
 
 
 def scene():
-    picture = np.asarray(sample_image("coffee"), float)
+    picture = np.asarray(sample_image("coffee", linear=True), float)
     return resize(picture.mean(axis=-1) if picture.ndim == 3 else picture, (64, 70))
 
 

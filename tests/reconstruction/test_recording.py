@@ -450,6 +450,7 @@ def test_what_has_seen_the_captures_is_one_of_three():
 
 
 HOLED = np.where(np.arange(42) == 9, np.nan, 1.0).reshape(1, 6, 7)
+ENDLESS = np.where(np.arange(42) == 9, np.inf, 1.0).reshape(1, 6, 7)
 
 
 @pytest.mark.parametrize(
@@ -460,7 +461,13 @@ HOLED = np.where(np.arange(42) == 9, np.nan, 1.0).reshape(1, 6, 7)
         (np.ones((1, 6, 7)), np.ones((1, 6, 7, 3)), {}, ValueError, "psfs .* the colours last"),
         (np.ones((1, 6, 7)), np.zeros((1, 3, 3)), {}, ValueError, "zero everywhere"),
         (np.ones((1, 6, 7)), np.ones((1, 3, 3)), {"valid": False}, ValueError, "valid is False"),
-        (HOLED, np.ones((1, 3, 3)), {}, ValueError, r"captures\[0\] holds NaN .* valid=numpy.isf"),
+        (
+            ENDLESS,
+            np.ones((1, 3, 3)),
+            {},
+            ValueError,
+            r"captures\[0\] holds NaN .* valid=numpy.isf",
+        ),
         (np.ones((1, 6, 7)), HOLED, {}, ValueError, "the PSFs hold NaN or infinity"),
         (np.ones((1, 6, 7)), -np.ones((1, 3, 3)), {}, ValueError, "a PSF sums to -9, which is neg"),
     ],
@@ -488,7 +495,7 @@ def test_captures_that_are_known_inside_jit_are_checked_there():
 
     psf = jnp.ones((3, 3))
     np.testing.assert_allclose(residual(psf), 0.5 * np.sum(np.square(capture)), rtol=1e-6)
-    holed = jnp.asarray(HOLED[0])
+    holed = jnp.asarray(ENDLESS[0])
     with pytest.raises(ValueError, match=r"captures\[0\] holds NaN"):
         jax.jit(lambda psf: tc.Recording([holed], tc.Psfs(psf[None])).problem())(psf)
 

@@ -464,7 +464,7 @@ def test_error_bars_cover_the_truth(count):
     """
     sensor, field = (80, 90), (40, 50)
     operator, noise = flatcam(sensor=sensor, field=field), 0.1
-    truth = resize(sample_image("camera")[60:300, 150:450], field)
+    truth = resize(sample_image("camera", linear=True)[60:300, 150:450], field)
     draws = np.random.default_rng(1).normal(size=(count, *sensor))
     captures = operator(jnp.asarray(truth)) + noise * jnp.asarray(draws)
     recording = tc.Recording(captures, operator, noise_variance=noise**2)

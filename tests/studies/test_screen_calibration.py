@@ -86,7 +86,7 @@ def colours():
     return tiny_screen.study(
         *(tiny_screen.camera(w * nm) for w in (633, 532, 473)),
         responses=tuple(wg.ColourBand(c * nm, 80 * nm) for c in (610, 535, 465)),
-        targets={"face": resize(sample_image("astronaut"), tiny_screen.CELLS)},
+        targets={"face": resize(sample_image("astronaut", linear=True), tiny_screen.CELLS)},
         solvers={"CGM": tc.Ridge(0.1)},
         models=(ScreenModel("right"), ScreenModel("separated", "no_crosstalk")),
     )

@@ -40,7 +40,7 @@ def comparison() -> MaskComparison:
         "zone plate": ComparedMask((zones(),), "zones"),
         "four phases": ComparedMask(tuple(map(zones, PHASES)), "zones", "fringe_scanning"),
     }
-    camera, astronaut = sample_image("camera"), sample_image("astronaut")
+    camera, astronaut = sample_image("camera", linear=True), sample_image("astronaut", linear=True)
     scenes = {
         "photograph": ComparedScene.of_picture(camera, FIELD),
         "points": ComparedScene.of_picture(point_grid((28, 28), (9, 9)), FIELD, "flat"),

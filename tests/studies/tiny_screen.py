@@ -42,7 +42,7 @@ def camera(wavelength: float = 532 * nm, tilt: Any = None) -> wg.SeeThroughCamer
 def study(*cameras: wg.SeeThroughCamera, **changed: Any) -> ScreenStudy:
     """The study with other cameras, or with other fields changed."""
     star = resize(siemens_star((40, 40)), CELLS)
-    photograph = sample_image("camera")
+    photograph = sample_image("camera", linear=True)
     photograph = middle_square(photograph, round(0.6 * min(photograph.shape)))
     targets = {"star": (star > star.mean()).astype(float), "camera": resize(photograph, CELLS)}
     fields: dict[str, Any] = {

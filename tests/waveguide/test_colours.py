@@ -184,7 +184,7 @@ def test_captures_are_sums_over_wavelengths(crosstalk):
 @pytest.mark.thorough
 def test_a_plan_says_whether_cross_talk_matters():
     """True errors at most the predicted ones; sharper responses need no cross-talk."""
-    sensor, picture = tc.Sensor((16, 12), 130 * um), sample_image("astronaut")
+    sensor, picture = tc.Sensor((16, 12), 130 * um), sample_image("astronaut", linear=True)
     picture = np.moveaxis(resize(picture, (12, 16)), -1, 0)
     lit = wg.LitPlane(plane(), picture)
     edge = wg.Rectangle((0.0, 20.0), (400.0, 40.0))

@@ -25,7 +25,7 @@ def through():
 
 @functools.cache
 def picture(name="camera"):
-    return resize(sample_image(name), (CELLS, CELLS))
+    return resize(sample_image(name, linear=True), (CELLS, CELLS))
 
 
 def clean(image, distance, width=1.5):
@@ -153,7 +153,7 @@ class TestJudgement:
 
 class TestPictureLikelihood:
     def test_a_ghost_costs_likelihood(self):
-        image = resize(sample_image("camera"), (60, 50))
+        image = resize(sample_image("camera", linear=True), (60, 50))
         doubled = image.copy()
         doubled[:-9] += 0.15 * image[9:]
         scale = typical_variance(image)
@@ -162,6 +162,6 @@ class TestPictureLikelihood:
         )
 
     def test_the_unit_is_free(self):
-        image = resize(sample_image("camera"), (24, 30))
+        image = resize(sample_image("camera", linear=True), (24, 30))
         log = picture_likelihood(image, 1e-3) - picture_likelihood(10 * image, 0.1)
         np.testing.assert_allclose(log, np.log(10.0), atol=1e-6)

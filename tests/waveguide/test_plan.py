@@ -55,7 +55,7 @@ def errors(plan, *lit):
 def pictures():
     """Photographs, a page of text, noise, and a few bright cells, in (24, 28) cells."""
     random = np.random.default_rng(8)
-    photographs = [resize(sample_image(name), CELLS) for name in ("camera", "page")]
+    photographs = [resize(sample_image(name, linear=True), CELLS) for name in ("camera", "page")]
     sparse = np.zeros(CELLS)
     sparse[random.integers(0, 24, 12), random.integers(0, 28, 12)] = 1
     blocks = np.kron(random.uniform(size=(6, 7)), np.ones((4, 4)))

@@ -70,7 +70,7 @@ def test_images_come_back(name, least):
         (sts, wg.ObjectPlane((64, 64), 550.0, 150.0, (0.0, 27.0))),
     )
     operator = wg.system_operator(sts, seen)
-    whole = sample_image(name)
+    whole = sample_image(name, linear=True)
     image = resize(whole if name == "camera" else whole[:180, :180], (64, 64))
     clean = operator(jnp.asarray(image, jnp.float32))
     deviation = float(jnp.sqrt(jnp.mean(clean**2))) * 10**-1.5
@@ -129,7 +129,7 @@ def test_a_colour_picture_comes_back():
     cameras = in_colours()
     operator = wg.system_operator(cameras, seen, 3)
     assert adjoint_error(operator, jax.random.key(1)) < 1e-14
-    picture = np.moveaxis(resize(sample_image("astronaut"), (12, 16)), -1, 0)
+    picture = np.moveaxis(resize(sample_image("astronaut", linear=True), (12, 16)), -1, 0)
     capture = operator(jnp.asarray(picture)[:, None])
     alone = [wg.system_operator(one, seen, 3)(jnp.asarray(picture)) for one in cameras]
     for n, by_own in enumerate(alone):

@@ -62,6 +62,9 @@ def checked(public: _Public) -> _Public:
     @any_rank
     @functools.wraps(public)
     def call(*args: Any, **kwargs: Any) -> Any:
+        given = zip((*names, *[""] * len(args)), args, strict=False)
+        args = tuple(_native(kinds.get(name), value) for name, value in given)
+        kwargs = {name: _native(kinds.get(name), value) for name, value in kwargs.items()}
         for name, value in (*zip(names, args, strict=False), *kwargs.items()):
             _refuse_unsound(name, value)
             allowed = kinds.get(name)
@@ -73,6 +76,14 @@ def checked(public: _Public) -> _Public:
         return public(*args, **kwargs)
 
     return typing.cast(_Public, call)
+
+
+def _native(allowed: _Kinds | None, value: Any) -> Any:
+    """An array of another library, or a masked one, as one of NumPy where its kind is checked."""
+    if not allowed or not (checks.is_foreign(value) or isinstance(value, np.ma.MaskedArray)):
+        return value
+    kept = checks.is_foreign(value) and any(kind.holds(value) for kind in allowed)
+    return value if kept else checks.native(value)
 
 
 def _refuse_unsound(name: str, value: Any) -> None:

@@ -73,10 +73,36 @@ def _known(value: Any) -> np.ndarray | None:
 
 
 def native(value: Any) -> np.ndarray:
-    """A NumPy array in the byte order of the machine, and of no more than double precision."""
+    """A NumPy array in the machine's byte order, of single or double precision; NaN where masked.
+
+    Takes arrays of other libraries: those with `__array__`, and by DLPack.
+    """
+    known, masked = without_mask(value)
+    wider = {"g": "d", "G": "D", "e": "f"}.get(known.dtype.char)
+    known = known.astype(wider or known.dtype.newbyteorder("="), copy=False)
+    if masked is not None:
+        known = np.where(masked, np.nan, known)
+    return known
+
+
+def without_mask(value: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """An array of any library, and where a masked array is masked, if it is anywhere."""
+    if is_foreign(value):
+        value = value.detach().cpu() if hasattr(value, "detach") else value  # of PyTorch
+        value = getattr(value, "values", value) if hasattr(value, "dims") else value  # of xarray
+        value = value if hasattr(value, "__array__") else np.from_dlpack(value)
+    masked = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else None
     known = np.asarray(value)
-    dtype = {"g": np.dtype("d"), "G": np.dtype("D")}.get(known.dtype.char, known.dtype)
-    return known.astype(dtype.newbyteorder("="), copy=False)
+    if known.dtype.name == "bfloat16":
+        known = known.astype(np.float32)
+    return known, masked if masked is not None and masked.any() else None
+
+
+def is_foreign(value: Any) -> bool:
+    """Whether it is an array of another library than NumPy and JAX."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return False
+    return any(hasattr(type(value), name) for name in ("__array__", "__dlpack__"))
 
 
 @contextlib.contextmanager

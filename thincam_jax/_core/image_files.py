@@ -23,6 +23,8 @@ _STARTS = {
     b"\x89PNG\r\n\x1a\n": "png",
     b"\x93NUMPY": "npy",
     b"\xff\xd8\xff": "jpeg",
+    **{b"P5": "pgm", b"P6": "pgm", b"PK\3\4": "npz", b"\x89HDF\r\n\x1a\n": "hdf5"},
+    **{b"MATLAB 5": "mat", b"MATLAB 7": "mat73", b"SIMPLE  ": "fits"},
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "tiff"),  # +: of more than 4 GB
 }
 # Largest ratio of pixel bytes to file bytes: LZW, the densest usual compression, reaches some 2500

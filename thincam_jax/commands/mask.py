@@ -52,7 +52,11 @@ def _image(path: str, width: float) -> masks.SampledMask:
 
 
 def _phases(path: str, width: float) -> masks.SampledMask:
-    phase = open_memmap(path, "r") if path.endswith(".npy") else 2 * np.pi * load_image(path)
+    phase = (
+        open_memmap(path, "r")
+        if path.endswith(".npy")
+        else 2 * np.pi * load_image(path, linear=True)
+    )
     return masks.SampledMask(np.exp(1j * phase), width / phase.shape[-1])
 
 

@@ -162,13 +162,15 @@ def check_keys(config: Any, **kinds: str) -> None:
 class TargetConfig(Section):
     """A scene: a drawn chart or pattern, a photograph of scikit-image, or an image file.
 
-    Charts and patterns are squares of `pixels` × `pixels`.
+    Charts and patterns are squares of `pixels` × `pixels`. `linear: true` takes an image's codes as
+    light; by default files are decoded (`load_image`), and scikit-image's photographs are not.
     """
 
     name: Name
     kind: Literal["usaf1951", "slanted_edge", "siemens_star", "point_grid", "photograph", "file"]
     image: str | None = None
     path: str | None = None
+    linear: bool | None = None
     pixels: Annotated[int, Field(ge=8, le=8192)] = 1700
 
     @pydantic.model_validator(mode="after")
@@ -181,7 +183,7 @@ class TargetConfig(Section):
 
 
 class PictureConfig(TargetConfig):
-    """A target that fills given cells.
+    """A target that fills given cells; by default the codes of a file are their levels.
 
     - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where it
       is below its mean, else white.

@@ -1,30 +1,39 @@
 """Linear images as 8-bit pictures."""
 
 import io
+import struct
 from typing import Any
 
 import numpy as np
 import PIL.Image
+import PIL.PngImagePlugin
 
 from thincam_jax._core import checks
+from thincam_jax.imaging.encoding import encode_srgb
 
 _QUALITY = 85  # of JPEG
 
 
 def eight_bit(
-    linear: np.ndarray, gamma: float | int = 2.2, percentile: float | int = 99.9
+    linear: np.ndarray, gamma: float | int | None = None, percentile: float | int = 99.9
 ) -> np.ndarray:
-    """round(255 clip(I/w, 0, 1)^(1/γ)), w this percentile of I; the maximum where that is 0."""
+    """round(255 clip(I/w, 0, 1)^(1/γ)), w this percentile of I; the maximum where that is 0.
+
+    Without γ the encoding is that of sRGB.
+    """
     balanced = np.maximum(linear, 0.0)
     white = np.percentile(balanced, percentile) or balanced.max()
     shown = np.clip(balanced / white, 0.0, 1.0) if white > 0 else balanced
-    return np.round(255 * shown ** (1 / gamma)).astype(np.uint8)
+    encoded = encode_srgb(shown) if gamma is None else shown ** (1 / gamma)
+    return np.round(255 * encoded).astype(np.uint8)
 
 
-def png_bytes(pixels: np.ndarray) -> bytes:
-    """A PNG file of 8-bit grey (y, x) or RGB (y, x, 3)."""
-    buffer = io.BytesIO()
-    PIL.Image.fromarray(pixels).save(buffer, format="PNG")
+def png_bytes(pixels: np.ndarray, gamma: float | int | None = None) -> bytes:
+    """A PNG file of 8-bit grey (y, x) or RGB (y, x, 3), which says the γ of its pixels."""
+    buffer, info = io.BytesIO(), PIL.PngImagePlugin.PngInfo()
+    if gamma is not None:
+        info.add(b"gAMA", struct.pack(">I", min(max(round(1e5 / gamma), 1), 2**31 - 1)))
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info)
     return buffer.getvalue()
 
 

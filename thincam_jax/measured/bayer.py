@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax.imaging.encoding import upright
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 Demosaicing = Literal["bilinear", "superpixel"]
@@ -72,6 +73,13 @@ def mosaic(
     """What a sensor with a pattern measures of red, green and blue light."""
     sites = np.stack(list(colour_sites(colours.shape[-2:], pattern).values()))
     return np.where(sites, colours, 0).sum(axis=-3)
+
+
+def turned_pattern(pattern: Pattern, shape: tuple[int, ...], orientation: int) -> Pattern:
+    """Pattern of a mosaic of a shape that was turned upright by its orientation."""
+    sites = colour_sites(shape, pattern)
+    letters = np.select(list(sites.values()), list(sites), "")
+    return cast(Pattern, "".join(upright(letters, orientation)[:2, :2].ravel()))
 
 
 def shifted_pattern(pattern: Pattern, top: int, left: int) -> Pattern:

@@ -1,7 +1,7 @@
 """Options of a preparation, and checks that PSF, capture and background are compatible."""
 
 import numbers
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -103,6 +103,58 @@ def _whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
+def by_files(
+    psf: Raw,
+    capture: Raw,
+    background: Any = None,
+    options: Preparation | None = None,
+    *,
+    psf_background: Any = None,
+    dead: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """Arguments of `prepare`, by the files where nothing is given: pattern, black levels.
+
+    Dead pixels join those that are given. **Errors**: MeasurementError for two patterns.
+    """
+    options = options or Preparation()
+    stated = dict.fromkeys(raw.bayer for raw in (capture, psf) if raw.bayer)
+    if options.bayer is None and len(stated) > 1:
+        raise MeasurementError(
+            f"the capture's file ({capture.name}) says the pattern {capture.bayer} and the PSF's "
+            f"({psf.name}) {psf.bayer}; give both from one sensor, stored in one orientation"
+        )
+    if options.bayer is None and stated and psf.channels == capture.channels == 1:
+        options = replace(options, bayer=next(iter(stated)))
+    if background is None and psf_background is None:
+        psf_background = psf.black_level
+    background = capture.black_level if background is None else background
+    for raw in (capture, psf):
+        if raw.dead is not None and raw.dead.shape == capture.pixels.shape[:2]:
+            dead = raw.dead if dead is None else dead | raw.dead
+    names = "background", "options", "psf_background", "dead"
+    return dict(zip(names, (background, options, psf_background, dead), strict=True))
+
+
+def _check_file(name: str, raw: Raw, background: Any, dead: Any, options: Preparation) -> None:
+    """Refuse what contradicts the facts of a file, and drops them."""
+    where = f"the {name}'s file ({raw.name}) says"
+    if raw.bayer is not None and raw.bayer != options.bayer:
+        given = "nothing is given" if options.bayer is None else f"bayer = {options.bayer!r}"
+        raise MeasurementError(f"{where} the pattern {raw.bayer}, but {given}; give {raw.bayer}")
+    level = raw.black_level
+    number = isinstance(background, numbers.Real) and not isinstance(background, bool)
+    if level and (background == "corner" or (number and abs(float(background) - level) > 1)):
+        given = "a dark corner" if background == "corner" else f"background = {background}"
+        raise MeasurementError(
+            f"{where} a black level of {level:g}, not {given}; give {level:g}, or a dark frame"
+        )
+    if raw.dead is not None and not np.all(raw.dead <= (False if dead is None else dead)):
+        raise MeasurementError(
+            f"the {name} ({raw.name}) has {raw.dead.sum()} NaN or masked pixels of "
+            f"{_size(raw)}; mark them in a map of the capture's size, dead=raw.dead"
+        )
+
+
 def check_match(
     psf: Raw,
     capture: Raw,
@@ -147,6 +199,8 @@ def check_match(
         )
     for name, raw in (("psf", psf), ("capture", capture)):
         _check_background(name, raw, psf, backgrounds[name])
+        hidden = dead if dead is None or dead.shape == raw.pixels.shape[:2] else None
+        _check_file({"psf": "PSF"}.get(name, name), raw, backgrounds[name], hidden, options)
 
 
 def _size(raw: Raw) -> str:

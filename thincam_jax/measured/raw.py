@@ -1,15 +1,18 @@
 """A measured image as the camera stored it, with its bit depth, and its validation."""
 
+import logging
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Numbers
+from thincam_jax._core.checks import Numbers, without_mask
 from thincam_jax._core.files import MeasurementError
+from thincam_jax.measured.bayer import Pattern
 
 MAX_CHANNELS = 4
+_LOGGER = logging.getLogger(__name__)
 
 
 class CaptureFileError(MeasurementError):
@@ -27,10 +30,13 @@ class Raw:
     - `format`: "tiff", "png", "npy", or "array".
     - `name`: in messages; the path of the file.
     - `sensor_shape`: of a PSF that was computed also beyond the sensor, that of the sensor.
+    - `bayer`, `black_level`, `white_level`: as its file says them, counts; None where it does not.
+      The white level is then the full scale.
+    - `dead`: map (y, x) of pixels that are NaN or masked; they are 0 in `pixels`. None: no such.
 
-    **Errors**: MeasurementError for another shape or type, an empty image, values that are not
-    finite, and values above 2^bits − 1. Signed integers are refused, but not negative floats, from
-    which a dark frame may have been subtracted.
+    **Errors**: MeasurementError for another shape or type, an empty image, infinite values, no
+    value that is a number, and values above 2^bits − 1. Signed integers are refused, but not
+    negative floats, from which a dark frame may have been subtracted.
     """
 
     pixels: np.ndarray = field(repr=False)
@@ -38,10 +44,14 @@ class Raw:
     format: str = "array"
     name: str = "the array"
     sensor_shape: tuple[int, int] | None = None
+    bayer: Pattern | None = None
+    black_level: float | None = None
+    white_level: int | None = None
+    dead: Bool[np.ndarray, "y x"] | None = field(default=None, repr=False)
 
     def __post_init__(self):
         try:
-            pixels = np.asarray(self.pixels)
+            pixels, masked = without_mask(self.pixels)
         except (ValueError, TypeError):  # rows of several lengths, random keys
             raise MeasurementError(f"{self.name}: is no array; give rows of one length") from None
         _check_shape(self.name, pixels)
@@ -49,10 +59,18 @@ class Raw:
         bits = 8 * pixels.dtype.itemsize if self.bits is None and pixels.dtype.kind == "u" else None
         if self.bits is not None:
             bits = _announced(self.name, self.bits, pixels)
-        if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
-            bad = np.count_nonzero(~np.isfinite(pixels))
+        dead = np.isnan(pixels) if pixels.dtype.kind == "f" else np.zeros(pixels.shape, bool)
+        dead = dead | (False if masked is None else masked)
+        if dead.any():
+            pixels = np.where(dead, 0, pixels).astype(pixels.dtype)
+            dead = dead if dead.ndim == 2 else dead.any(axis=2)
+            object.__setattr__(self, "dead", dead if self.dead is None else dead | self.dead)
+            _LOGGER.warning("%s: %d pixels are NaN or masked: taken as dead", self.name, dead.sum())
+        bad = int(np.isinf(pixels).sum()) if pixels.dtype.kind == "f" else 0
+        if bad or (self.dead is not None and self.dead.all()):
             raise MeasurementError(
-                f"{self.name}: {bad} of {pixels.size} values are NaN or infinite; give finite ones"
+                f"{self.name}: {bad or pixels.size} of {pixels.size} values are NaN or infinite; "
+                "give finite ones"
             )
         if bits is not None:
             _check_range(self.name, pixels, bits)
@@ -62,7 +80,9 @@ class Raw:
 
     @property
     def full_scale(self) -> float:
-        """Count of a saturated pixel: 2^bits − 1, or 1 for floats of unknown scale."""
+        """Count of a saturated pixel: white level or 2^bits − 1; 1 for floats of unknown scale."""
+        if self.white_level is not None:
+            return float(self.white_level)
         return 1.0 if self.bits is None else float(2**self.bits - 1)
 
     @property

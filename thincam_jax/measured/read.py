@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -17,6 +18,7 @@ import tifffile
 from jaxtyping import Bool
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.files import open_regular
 from thincam_jax._core.image_files import (
     ImageFileError,
     kind_of,
@@ -25,11 +27,23 @@ from thincam_jax._core.image_files import (
     read_whole,
     tiff_pages,
 )
+from thincam_jax.imaging.encoding import ORIENTATION, upright
+from thincam_jax.measured.bayer import PATTERNS, turned_pattern
+from thincam_jax.measured.containers import OPENERS, read_array, read_pgm
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
+
+_Facts = dict[str, Any]  # bits, orientation, and those of `Raw`, where a file says them
 
 # Raw files of cameras, most of which are TIFF with previews of their own.
 RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
-SUFFIXES = (".tif", ".tiff", ".png", ".npy", *RAW_SUFFIXES)
+SUFFIXES = (".tif", ".tiff", ".png", ".npy", ".pgm", ".ppm", ".fits", *RAW_SUFFIXES)
+_KEYED = re.compile(r"(?i)(.+\.(?:npz|mat|h5|hdf5|fits?)):(.+)")
+# By their first bytes, or those after a length: names, and what imageio is to read.
+_OTHERS = {
+    **{b"GIF8": ("a GIF", ", index=0"), b"BM": ("a BMP", ""), b"WEBP": ("a WebP", "")},
+    **{b"AVI ": ("an AVI film", ", index=0"), b"ftyp": ("an MP4 film or HEIF", ", index=0")},
+    **{b"jP  ": ("a JPEG 2000", ""), b"v/1\1": ("an OpenEXR", ""), b"8BPS": ("a PSD", "")},
+}
 # Photometric interpretations that hold counts: no palette, inverted scale or colour difference.
 _PLAIN = (
     tifffile.PHOTOMETRIC.MINISBLACK,
@@ -37,6 +51,8 @@ _PLAIN = (
     tifffile.PHOTOMETRIC.CFA,
     tifffile.PHOTOMETRIC.LINEAR_RAW,
 )
+_UNDAMAGED = "give an undamaged TIFF, PNG, JPEG or NPY file"
+_FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  # orientations by LibRaw
 _NONLINEAR = (
     "a JPEG's counts are not in proportion to the light (gamma, tone curve, compression), so that "
     "images show rings and wrong greys; save the camera's raw frames as TIFF or PNG"
@@ -51,16 +67,19 @@ class NonlinearWarning(UserWarning):
 def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     """Read one image as it is stored, without scaling or gamma.
 
-    TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY. An opaque
-    alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is read with
-    a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files of cameras
-    need the extra `raw`; they give their mosaic (y, x) with the black level in it.
+    TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY; PGM and PPM;
+    an array of NPZ, MATLAB, HDF5 or FITS, by its key as "file.mat:capture" where there are several.
+    An opaque alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is
+    read with a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files
+    of cameras need the extra `raw`; they give their mosaic (y, x) with the black level in it, and
+    what the file says of it: pattern, black and white level. Images are turned upright, and their
+    pattern with them, as their orientation (EXIF, TIFF) says. NaN are dead pixels.
 
     **Errors**: CaptureFileError, one line, for a file that is missing, truncated, damaged or no
     image, for a stack of images, and for everything that `Raw` refuses.
     """
-    (pixels,), kind, found = _decode(Path(path))
-    return _raw(pixels, found if bits is None else bits, kind, str(path))
+    (pixels,), kind, facts = _decode(Path(path))
+    return _raw(pixels, bits, kind, str(path), facts)
 
 
 @checked
@@ -72,14 +91,24 @@ def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[R
     path = Path(path)
     if path.is_dir():
         return [read_image(one, bits) for one in image_files(path)]
-    pages, kind, found = _decode(path, stack=True)
-    bits = found if bits is None else bits
-    return [_raw(page, bits, kind, f"{path}, image {n}") for n, page in enumerate(pages, 1)]
+    pages, kind, facts = _decode(path, stack=True)
+    return [_raw(page, bits, kind, f"{path}, image {n}", facts) for n, page in enumerate(pages, 1)]
 
 
-def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str) -> Raw:
+def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str, facts: _Facts) -> Raw:
+    """The image, upright, with the facts of its file."""
+    facts = dict(facts)
+    found, orientation = facts.pop("bits", None), facts.pop("orientation", 1)
+    if bits is not None and "white_level" in facts and bits != found:
+        raise CaptureFileError(
+            f"{name}: bits = {bits}, but the file says {found} bit (white level "
+            f"{facts['white_level']}); leave `bits` out"
+        )
     try:
-        return Raw(pixels, bits, kind, name)
+        if orientation != 1 and "bayer" in facts:
+            facts["bayer"] = turned_pattern(facts["bayer"], pixels.shape, orientation)
+        pixels = upright(pixels, orientation)
+        return Raw(pixels, found if bits is None else bits, kind, name, **facts)
     except MeasurementError as error:
         raise CaptureFileError(str(error)) from None
 
@@ -92,13 +121,13 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
 
     **Errors**: CaptureFileError as in `read_image`.
     """
-    (pixels,), _, _ = _decode(Path(path))
+    (pixels,), _, facts = _decode(Path(path))
     if pixels.ndim != 2 or pixels.size == 0 or pixels.dtype.kind not in "buif":
         raise CaptureFileError(
             f"{path}: holds {pixels.dtype} values of shape {pixels.shape}; give a map (y, x) that "
             "is zero for all pixels but the marked ones"
         )
-    return pixels != 0
+    return upright(pixels, facts.get("orientation", 1)) != 0
 
 
 @checked
@@ -147,10 +176,14 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
 
 
-def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int | None]:
-    """Pixels of each image, format, and bits a sample if known; several images only of a stack."""
+def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Facts]:
+    """Pixels of each image, format, and facts of the file; several images only of a stack."""
+    named = _KEYED.fullmatch(str(path))
+    path, key = (Path(named[1]), named[2]) if named and not path.exists() else (path, None)
     kind = _kind(path)
-    readers = {
+    readers: dict[str, Any] = {
+        **{one: partial(_read_container, one, key) for one in OPENERS},
+        "pgm": read_pgm,
         "png": _read_png,
         "jpeg": _read_jpeg,
         "tiff": partial(_read_tiff, stack=stack),
@@ -159,7 +192,7 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
     }
     try:
         with _silence():
-            images, bits = readers[kind](read_whole(path, kind))
+            images, facts = readers[kind](read_whole(path, kind))
     except (CaptureFileError, ImageFileError) as error:
         raise CaptureFileError(f"{path}: {error}") from None
     except Exception as error:  # each decoder raises its own kind
@@ -172,7 +205,21 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
         ) from None
     if kind == "jpeg":
         warnings.warn(f"{path}: {_NONLINEAR}", NonlinearWarning, stacklevel=3)
-    return images, kind, bits
+    return images, kind, facts
+
+
+def _true_name(path: Path) -> str:
+    """What a file is that is not read, and the line of Python that brings it in."""
+    with open_regular(path) as (file, _):
+        start = file.read(12)
+    array = f"numpy.save({str(path.with_suffix('.npy'))!r}"
+    if path.suffix.lower() in (".raw", ".raw10", ".raw12", ".bin"):
+        given = f"measured.unpack_raw({str(path)!r}, (rows, columns), bits=10)"
+        return f"is packed counts without their size; {array}, {given})"
+    for first, (name, call) in _OTHERS.items():
+        if first in (start[: len(first)], start[4 : 4 + len(first)], start[8 : 8 + len(first)]):
+            return f"is {name}; {array}, imageio.v3.imread({str(path)!r}{call}))"
+    return f"is not an image that can be read; {_UNDAMAGED}, or {array}, pixels)"
 
 
 def _kind(path: Path) -> str:
@@ -186,23 +233,28 @@ def _kind(path: Path) -> str:
         raise CaptureFileError(f"{path}: cannot be read ({error.strerror or error})") from None
     if kind is not None and path.suffix.lower() in RAW_SUFFIXES:
         return "raw"
+    if kind is None:
+        raise CaptureFileError(f"{path}: {_true_name(path)}")
     if not kind:
-        what = "is not an image that can be read" if kind is None else "is empty or cut short"
-        raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG, JPEG or NPY file")
+        raise CaptureFileError(f"{path}: is empty or cut short; {_UNDAMAGED}")
     return kind
 
 
-def _read_npy(data: bytes) -> tuple[list[np.ndarray], None]:
+def _read_container(kind: str, key: str | None, data: bytes) -> tuple[list[np.ndarray], _Facts]:
+    return [read_array(kind, data, key)], {}
+
+
+def _read_npy(data: bytes) -> tuple[list[np.ndarray], _Facts]:
     stream = io.BytesIO(data)
     _, dtype = npy_header(stream)
     if dtype.hasobject or dtype.fields:
         raise CaptureFileError(f"holds {dtype} values, no image; give uint8, uint16 or float")
     stream.seek(0)
-    return [np.load(stream, allow_pickle=False)], None
+    return [np.load(stream, allow_pickle=False)], {}
 
 
-def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
-    """Pixels (y, x) or (y, x, channel) and bits a sample."""
+def _read_png(data: bytes) -> tuple[list[np.ndarray], _Facts]:
+    """Pixels (y, x) or (y, x, channel), and their bits and orientation."""
     _, _, depth, colour, *_ = png_header(data)
     if colour == 3:
         raise CaptureFileError("stores a palette, no counts; save it as grey or RGB")
@@ -210,21 +262,24 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
         raise CaptureFileError(f"has {depth} bit a sample; 8 to 16 are read")
     if b"acTL" in data[: data.find(b"IDAT")]:
         raise CaptureFileError("is animated; give one image a file")
+    stored, orientation = _by_pillow(data)
     if depth == 16 and colour:  # of which Pillow keeps 8 bits
         import imagecodecs
 
         pixels = imagecodecs.png_decode(data)
     else:
-        pixels = _by_pillow(data).astype(f"uint{depth}", copy=False)
-    return [_without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))], depth
+        pixels = stored.astype(f"uint{depth}", copy=False)
+    pixels = _without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))
+    return [pixels], {"bits": depth, "orientation": orientation}
 
 
-def _by_pillow(data: bytes) -> np.ndarray:
+def _by_pillow(data: bytes) -> tuple[np.ndarray, int]:
+    """Pixels as they are stored, and their orientation."""
     with PIL.Image.open(io.BytesIO(data)) as file:
-        return np.array(file)
+        return np.array(file), file.getexif().get(ORIENTATION, 1)
 
 
-def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], int]:
+def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
     """The mosaic of a camera's raw file, without the rows and columns beyond its image."""
     try:
         import rawpy
@@ -236,21 +291,44 @@ def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], int]:
         pixels = file.raw_image_visible.copy()
         if pixels.ndim != 2:
             raise CaptureFileError("holds colours, no mosaic; save it as TIFF")
-        return [pixels], max(8, int(file.white_level).bit_length())
+        letters = file.color_desc.decode("ascii", "replace")
+        sites = [letters[n] for n in file.raw_colors_visible[:2, :2].ravel()]
+        sites = "".join(sites) if np.asarray(file.raw_pattern).size == 4 else ""
+        facts = _sensor_facts(sites, file.black_level_per_channel, [int(file.white_level)])
+        return [pixels], {"bits": 16, **facts, "orientation": _FLIPS[file.sizes.flip]}
 
 
-def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], int]:
-    return [_by_pillow(data)], 8
+def _sensor_facts(sites: str, black: Any, white: Any) -> _Facts:
+    facts: _Facts = {"bayer": sites} if sites in PATTERNS else {}
+    facts |= {"black_level": float(np.mean(black))} if len(black) in (1, 4) else {}
+    if len(white) == 0 or white[0] >= 2**16 - 1:  # which may stand for none
+        return facts
+    return facts | {"white_level": int(white[0]), "bits": max(8, int(white[0]).bit_length())}
 
 
-def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], int | None]:
-    """Pixels (y, x) or (y, x, channel) of each image and bits a sample; no bits for floats."""
+def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], _Facts]:
+    pixels, orientation = _by_pillow(data)
+    return [pixels], {"bits": 8, "orientation": orientation}
+
+
+def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], _Facts]:
+    """Pixels (y, x) or (y, x, channel) of each image, and facts; no bits for floats."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         pages = _whole_pages(file, stack)
         images = [_read_page(page) for page in pages]
-        bits = pages[0].bitspersample
-    is_count = images[0].dtype.kind == "u" and isinstance(bits, int)
-    return images, bits if is_count and 8 <= bits <= 16 else None
+        return images, _tiff_facts(pages[0])
+
+
+def _tiff_facts(page: tifffile.TiffPage) -> _Facts:
+    """By the tags of TIFF and DNG."""
+    bits, facts = page.bitspersample, {"orientation": page.tags.valueof(ORIENTATION, 1)}
+    if page.dtype is not None and page.dtype.kind == "u" and isinstance(bits, int):
+        facts |= {"bits": bits} if 8 <= bits <= 16 else {}
+    if page.photometric != tifffile.PHOTOMETRIC.CFA:
+        return facts
+    sites = "".join("RGB???"[min(n, 5)] for n in bytes(page.tags.valueof(33422, b"")))
+    black, white = (np.ravel(page.tags.valueof(tag, [])) for tag in (50714, 50717))
+    return facts | _sensor_facts(sites, black, white)
 
 
 def _read_page(page: tifffile.TiffPage) -> np.ndarray:

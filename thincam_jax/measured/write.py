@@ -38,9 +38,9 @@ def write_image(
 ) -> Path:
     """Write a linear image (channel, y, x), and `log` beside it as NAME.json.
 
-    By suffix: `.png` 8 bit for viewing, by `to_display` with the keyword arguments; `.npy`, `.tif`
-    and `.tiff` float32, linear, (y, x) or (y, x, channel). The folder must exist. The log is
-    written first, so that no image is without it.
+    By suffix: `.png` 8 bit for viewing, by `to_display` with the keyword arguments, whose gamma it
+    says; `.npy`, `.tif` and `.tiff` float32, linear, (y, x) or (y, x, channel). The folder must
+    exist. The log is written first, so that no image is without it.
 
     **Errors**: MeasurementError for another suffix and an image that cannot be displayed; OSError
     where writing fails.
@@ -53,9 +53,8 @@ def write_image(
             "give one of these suffixes"
         )
     if suffix == ".png":
-        content = png_bytes(
-            to_display(image, white_balance=white_balance, gamma=gamma, percentile=percentile)
-        )
+        shown = to_display(image, white_balance=white_balance, gamma=gamma, percentile=percentile)
+        content = png_bytes(shown, gamma)
     else:
         content = linear_bytes(checks.numbers("image", image).astype(np.float32), suffix)
     if log is not None:

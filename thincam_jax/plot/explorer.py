@@ -111,7 +111,7 @@ class Explorer:
                 f"the sensor has {camera.sensor.shape} pixels; give one of at most {_MOST_PIXELS} "
                 "a side to explore"
             )
-        image = sample_image("camera") if scene is None else scene
+        image = sample_image("camera", linear=True) if scene is None else scene
         self.scene = ImagePlane(image, distance=1.0, width=1.0).image  # checked there
         if self.scene.ndim != 2:
             raise ValueError(f"scene has shape {self.scene.shape}; give one image (y, x)")

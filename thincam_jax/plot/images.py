@@ -30,7 +30,7 @@ def capture(image: Any, sensor: Sensor | Number) -> Figure:
     figure = new_figure(5.0, 4.0)
     axes = figure.subplots()
     if shown.ndim == 3:
-        show_image(axes, np.clip(shown / (shown.max() or 1), 0, 1), float(pitch))
+        show_image(axes, eight_bit(shown, percentile=100), float(pitch))
     else:
         grey = show_image(axes, shown, float(pitch), vmin=min(0.0, shown.min()))
         figure.colorbar(grey, ax=axes, label="pixel value")
@@ -39,7 +39,9 @@ def capture(image: Any, sensor: Sensor | Number) -> Figure:
 
 @checked
 def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
-    """Images beside each other, each from black to its own white, with gamma 2.2.
+    """Images beside each other, each from black to its own white, encoded by sRGB once.
+
+    They are light: a photograph by `load_image`, not its codes.
 
     Axes are in mm on the object where a reconstruction knows its pitch.
 

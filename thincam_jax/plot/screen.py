@@ -9,6 +9,7 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
+from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.pictures import Reconstructed
 from thincam_jax.studies.rig import ShownPictures
@@ -64,8 +65,7 @@ def in_colour(capture: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     level = np.clip(capture / np.percentile(capture, 99.8), 0, 1)[..., None]
     linear = level * srgb(wavelength)
     linear = np.clip(linear.sum(axis=0), 0, 1) if linear.ndim == 4 else linear
-    encoded = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return encoded[::-1, ::-1]
+    return encode_srgb(linear)[::-1, ::-1]
 
 
 def draw_result(result: ScreenResult, rays: wg.Rays) -> dict[str, Figure]:

@@ -54,7 +54,8 @@ def draw_found(
     first, aspect = int(with_capture), truth.shape[0] / truth.shape[1]
     drawn, wholes, details = _pairs_of_axes(first + len(panels), aspect, figure)
     axes = zip(wholes[first:], details[first:], panels, strict=True)
-    for ax, detail, (name, image, caption) in axes:
+    for ax, detail, (name, light, caption) in axes:
+        image = target.shown(light)
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         part, label = enlarged_part(image, target)
         _show(detail, part, "")

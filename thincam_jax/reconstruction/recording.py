@@ -42,6 +42,7 @@ from thincam_jax.reconstruction.synthesis import (
     synthesis_matrix,
     with_channel,
 )
+from thincam_jax.reconstruction.unknown_pixels import known_and_valid, without_unknown
 
 # Part of a capture's pixels that may be negative by noise alone.
 _DARKEST = 0.01
@@ -59,7 +60,8 @@ class Recording(Module):
       operator of `thincam_jax.imaging.operators`, or a list of operators of one image.
     - `noise_variance`: one number, or one for each capture, in the captures' units squared. By
       default it is estimated by `estimate_variance`, which needs captures that are images.
-    - `valid`: mask of the valid pixels, that broadcasts to the captures.
+    - `valid`: mask of the valid pixels, that broadcasts to the captures. Those that are masked
+      (`numpy.ma`) or NaN are not valid either; a warning in the log says how many.
     - `background`: known light that is not the scene's, such as a black level or a dark frame: one
       for all captures, or one for each, that broadcasts to them. By default it is unknown behind
       `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
@@ -122,13 +124,16 @@ class Recording(Module):
         self.imaging_model = imaging_model
         if not isinstance(captures, list | tuple) and np.ndim(captures) == 0:
             raise TypeError(f"captures is {checks.shown(captures)}; give an array for each camera")
-        self.captures = tuple(as_real(c) for c in captures)
+        pairs = [without_unknown(capture) for capture in captures]
+        self.captures, known = tuple(as_real(c) for c, _ in pairs), [one for _, one in pairs]
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
         self.background = None if background is None else self._backgrounds(background)
         if noise_variance is not None:
             given_variances(noise_variance, self.captures)  # refuses others
         self.valid = None if valid is None else self._masks(valid)
+        if any(one is not None for one in known):
+            self.valid = known_and_valid(known, self.valid, [c.shape for c in self.captures])
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
         if not isinstance(imaging_model, Stacked):  # operators may have masks of their own

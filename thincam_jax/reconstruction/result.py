@@ -51,7 +51,7 @@ class Reconstruction(Module):
         return self.pitch is not None and self.pitch.ndim > 0
 
     def _repr_png_(self) -> bytes:
-        """Figure for notebooks: axes in mm, gamma 2.2; planes and a batch side by side."""
+        """Figure for notebooks: axes in mm, sRGB; planes and a batch side by side."""
         from thincam_jax.plot.frame import as_png
         from thincam_jax.plot.images import draw_result
 

@@ -83,7 +83,7 @@ def hold_out(study: Study, photographs: tuple[str, ...]) -> HeldOut:
 
 def _square(name: str) -> np.ndarray:
     """The middle of a photograph, grey."""
-    image = np.atleast_3d(sample_image(name)).mean(axis=-1)
+    image = np.atleast_3d(sample_image(name, linear=True)).mean(axis=-1)
     side = min(image.shape)
     rows, columns = ((n - side) // 2 for n in image.shape)
     return resize(image[rows : rows + side, columns : columns + side], (_PIXELS, _PIXELS))

@@ -13,6 +13,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import decimal_value
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.imaging import targets as drawn
+from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import AbstractNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.lensless.camera import LenslessCamera
@@ -200,7 +201,13 @@ class Target:
     @classmethod
     def photograph(cls, name: str, distance: float, width: float) -> "Target":
         """A photograph of scikit-image, such as "astronaut"."""
-        return cls.of_image(name, drawn.sample_image(name), distance, width, "photograph")
+        return cls.of_image(
+            name, drawn.sample_image(name, linear=True), distance, width, "photograph"
+        )
+
+    def shown(self, image: np.ndarray) -> np.ndarray:
+        """An image of it for a page: that of a decoded file is encoded by sRGB."""
+        return encode_srgb(np.clip(image, 0, 1)) if self.kind == "file" else image
 
     @property
     def is_picture(self) -> bool:

@@ -132,7 +132,7 @@ def distance_from_ghosts(
     screen = wg.Screen(hologram, glass_thickness=5.0, glass_index=1.5)
     camera = wg.SeeThroughCamera(screen, tc.Sensor((44, 36), 48 * um), 6.0, 10.0)
     plane = wg.ObjectPlane((80, 80), distance=430.0, width=250.0, centre=(0.0, 60.0))
-    picture = jnp.asarray(resize(sample_image("camera"), (80, 80)), jnp.float32)
+    picture = jnp.asarray(resize(sample_image("camera", linear=True), (80, 80)), jnp.float32)
     capture = wg.system_operator(camera, plane)(picture)
     found = wg.distance_from_ghosts(camera, np.asarray(capture), nearest=300.0, farthest=1000.0)
     print(found.status.name, found.distance, found.standard_error)

@@ -44,7 +44,7 @@ search:
   frequencies: {radii: 64, directions: 1, exact: 64}
 targets:
   - {name: chart, kind: usaf1951, pixels: 120}
-  - {name: picture, kind: file, path: PICTURE}
+  - {name: picture, kind: file, path: PICTURE, linear: true}
 validate: {seeds: 2, best: 1, photographs: 3}
 """
 

@@ -1,7 +1,10 @@
 """Experiment files: every fault is one line that names the place, the field and what is allowed."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
+import PIL.Image
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,8 +13,11 @@ from helpers import ROOT
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.kinds import load_experiment
-from thincam_jax.commands.sections import StudyConfig
-from thincam_jax.imaging.targets import sample_images
+from thincam_jax.commands.sections import PictureConfig, StudyConfig, TargetConfig
+from thincam_jax.commands.study.build import read_picture
+from thincam_jax.imaging.encoding import decode_srgb
+from thincam_jax.imaging.targets import sample_image, sample_images
+from thincam_jax.studies.study import Target
 
 BASE = """\
 # A comment, so that the first key is not in the first line.
@@ -371,3 +377,23 @@ def test_wavelengths_are_those_of_light(tmp_path, override):
     path.write_text(BASE, encoding="utf-8")
     with pytest.raises(ConfigError, match="is no wavelength of light; give 10 nm to 0.1 mm"):
         load_experiment(path, (override,))
+
+
+def test_pictures_are_light_and_pages_show_their_codes(tmp_path):
+    """A file is decoded, scikit-image's photographs and the levels of cells are not."""
+    codes = np.random.default_rng(0).integers(0, 256, (9, 14), dtype=np.uint8)
+    PIL.Image.fromarray(codes).save(tmp_path / "a.png")
+    picture = {"name": "a", "kind": "file", "path": str(tmp_path / "a.png")}
+    light = read_picture(TargetConfig(**picture))
+    np.testing.assert_allclose(light, decode_srgb(codes / 255))
+    for config in (TargetConfig(**picture, linear=True), PictureConfig(**picture)):
+        np.testing.assert_allclose(read_picture(config), codes / 255)
+    np.testing.assert_allclose(read_picture(PictureConfig(**picture, linear=False)), light)
+    photograph = {"name": "a", "kind": "photograph", "image": "coins"}
+    known = sample_image("coins", linear=True)
+    np.testing.assert_array_equal(read_picture(TargetConfig(**photograph)), known)
+    decoded = sample_image("coins")
+    np.testing.assert_array_equal(read_picture(TargetConfig(**photograph, linear=False)), decoded)
+    target = Target.of_image("a", light, 100.0, 20.0)
+    np.testing.assert_allclose(target.shown(light), codes / 255, atol=1e-6)
+    assert replace(target, kind="photograph").shown(light) is light

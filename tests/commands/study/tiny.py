@@ -39,7 +39,7 @@ methods:
       - {beta: 21 rad/mm^2, distance: 3 mm}
 targets:
   - {name: chart, kind: usaf1951, pixels: 120}
-  - {name: picture, kind: file, path: PICTURE}
+  - {name: picture, kind: file, path: PICTURE, linear: true}
 """
 
 # Phases 0, π/2, π, 3π/2 at β = 25, of which the pairs use two, and two more at β = 21.

@@ -28,7 +28,7 @@ def write(path, pixels):
     ],
 )
 def test_the_full_range_of_every_depth_is_0_to_1(tmp_path, name, pixels, step):
-    image = load_image(write(tmp_path / name, pixels))
+    image = load_image(write(tmp_path / name, pixels), linear=True)
     assert image.dtype == np.float64
     np.testing.assert_allclose(image, RAMP, rtol=0, atol=0.51 * step)
     assert (image.min(), image.max()) == (0.0, 1.0)
@@ -37,13 +37,13 @@ def test_the_full_range_of_every_depth_is_0_to_1(tmp_path, name, pixels, step):
 def test_alpha_is_dropped_and_channels_keep_their_order(tmp_path):
     pixels = np.zeros((9, 14, 4), np.uint8)
     pixels[2, 3], pixels[4, 5, :3], pixels[8, 13, 2] = (255, 51, 0, 7), 102, 255
-    image = load_image(str(write(tmp_path / "a.png", pixels)))
+    image = load_image(str(write(tmp_path / "a.png", pixels)), linear=True)
     assert image.shape == (9, 14, 3)
     assert image[2, 3] == pytest.approx([1.0, 0.2, 0.0])
     assert image[4, 5] == pytest.approx([0.4, 0.4, 0.4])
     assert image[8, 13].tolist() == [0.0, 0.0, 1.0]
     grey = write(tmp_path / "b.png", pixels[..., :2])
-    np.testing.assert_allclose(load_image(grey), pixels[..., 0] / 255)
+    np.testing.assert_allclose(load_image(grey, linear=True), pixels[..., 0] / 255)
 
 
 def test_no_file_and_folder(tmp_path):
@@ -87,7 +87,9 @@ def test_contents_that_are_no_image_in_0_to_1(tmp_path, pixels, message):
 
 @pytest.mark.parametrize("name", ["astronaut", "chelsea", "coffee", "camera", "rocket", "coins"])
 def test_samples_are_those_of_scikit_image(name):
-    np.testing.assert_array_equal(sample_image(name), getattr(skimage.data, name)() / 255)
+    np.testing.assert_array_equal(
+        sample_image(name, linear=True), getattr(skimage.data, name)() / 255
+    )
 
 
 def test_every_listed_sample_can_be_read():

@@ -28,7 +28,7 @@ def random_case(random: np.random.Generator):
     mask = tc.FresnelZoneAperture(beta, random.uniform(0, 6), width=width)
     camera = tc.LenslessCamera(mask, tc.Sensor(SENSOR, pitch), distance)
     t = math.exp(random.uniform(math.log(50), math.log(2000)))
-    picture = resize(sample_image("astronaut").mean(axis=-1), FIELD)
+    picture = resize(sample_image("astronaut", linear=True).mean(axis=-1), FIELD)
     image = np.clip(picture + random.uniform(0, 0.6) * random.normal(size=FIELD), 0, None)
     plane = tc.ImagePlane(image, t, FIELD[1] * pitch / distance * t)
     scene = tc.Scene(plane, random.uniform(400, 700) * nm)

@@ -31,7 +31,7 @@ def camera(name):
 
 
 def deep():
-    image = resize(sample_image("camera"), (40, 44))
+    image = resize(sample_image("camera", linear=True), (40, 44))
     return tc.Scene(
         [tc.ImagePlane(image * (1 + t / 100), t, 0.15 * t / 4) for t in DISTANCES], LIGHT
     )

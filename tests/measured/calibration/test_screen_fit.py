@@ -163,7 +163,7 @@ def test_another_distance_without_measuring(distance):
     fit = fit_screen(ghosts(0.05), camera(pixels=(55, 55), pitch=38.4 * um), plane())
     seen = plane(distance, (0.0, 27.0), (32, 32))
     true = wg.system_operator(camera(**TRUE, pixels=(55, 55), pitch=38.4 * um), seen, samples=4)
-    image = resize(sample_image("camera"), (32, 32))
+    image = resize(sample_image("camera", linear=True), (32, 32))
     clean = true(jnp.asarray(image))
     deviation = float(jnp.sqrt(jnp.mean(clean**2))) * 10**-1.5
     capture = clean + deviation * jax.random.normal(jax.random.key(0), clean.shape)

@@ -159,7 +159,7 @@ def _training(config: DesignConfig) -> TrainingPlan | None:
     if asked is None:
         return None
     return TrainingPlan(
-        {name: sample_image(name) for name in asked.images},
+        {name: sample_image(name, linear=True) for name in asked.images},
         TrainingError(asked.reconstruction),
         TrainingSettings(asked.samples, asked.starts, asked.steps, config.search.grid),
         asked.pixels,

@@ -19,6 +19,7 @@ from thincam_jax.commands.interrupt import INTERRUPTED
 from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
+from thincam_jax.measured.options import by_files
 from thincam_jax.measured.write import linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver
 from thincam_jax.reconstruction.depth import depth_of_colours
@@ -123,14 +124,10 @@ class Rig:
         self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
 
     def prepare(self, capture: Path, focus: int = 0) -> measured.Prepared:
-        return measured.prepare(
-            self.psfs[focus],
-            measured.read_image(capture, self.sources.bits),
-            self.background,
-            self.sources.preparation,
-            psf_background=self.psf_background,
-            dead=self.dead,
-        )
+        psf, image = self.psfs[focus], measured.read_image(capture, self.sources.bits)
+        known = {"psf_background": self.psf_background, "dead": self.dead}
+        given = self.background, self.sources.preparation
+        return measured.prepare(psf, image, **by_files(psf, image, *given, **known))
 
 
 def _background(given: Background, bits: int | None) -> measured.Raw | float | None:

@@ -99,10 +99,12 @@ def build_optics(
 
 def read_picture(target: TargetConfig) -> np.ndarray:
     """Drawn, a photograph or a file: (y, x) or (y, x, channel)."""
+    codes = target.kind == "photograph" or isinstance(target, PictureConfig)
+    linear = codes if target.linear is None else target.linear
     if target.kind == "photograph":
-        return drawn.sample_image(target.image or "")
+        return drawn.sample_image(target.image or "", linear=linear)
     if target.kind == "file":
-        return drawn.load_image(target.path or "")
+        return drawn.load_image(target.path or "", linear=linear)
     shape = (target.pixels, target.pixels)
     if target.kind == "point_grid":
         return drawn.point_grid(shape, count=(9, 9))

@@ -112,7 +112,8 @@ class _StudyRun(Run):
         folder.save_image(f"{place}--capture", raw / raw.max())
         shown = {"scene": plot.truth_of(self.evaluations)}
         shown |= {name: evaluation.image for name, evaluation in self.evaluations.items()}
-        for name, image in shown.items():
+        for name, light in shown.items():
+            image = target.shown(light)
             folder.save_image(f"{place}--{slug(name)}", image)
             folder.save_image(
                 f"{place}--{slug(name)}--detail", plot.enlarged_part(image, target)[0]

@@ -1,19 +1,23 @@
 """Photographs: from a file, from scikit-image's own samples, and resampled to a pixel count."""
 
+import contextlib
 import io
 import os
 import warnings
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import PIL.Image
 import skimage
 import tifffile
 from jaxtyping import ArrayLike, Float64, Num
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.image_files import ImageFileError, kind_of, read_whole
+from thincam_jax._core.image_files import ImageFileError, kind_of, png_header, read_whole
+from thincam_jax.imaging.encoding import ORIENTATION, decoded, upright
 
 # Files inside the scikit-image package itself; other names of `skimage.data` need a download.
 _PLAIN = (
@@ -32,11 +36,18 @@ _SAMPLES = {name: f"{name}.png" for name in _PLAIN} | {
 
 
 @checked
-def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channel"]:
-    """An image file as float64 in [0, 1], of shape (y, x), or (y, x, 3) if it has colours.
+def load_image(
+    path: str | os.PathLike[str], *, linear: bool = False
+) -> Float64[np.ndarray, "y x *channel"]:
+    """An image file as linear light, float64 in [0, 1]: (y, x), or (y, x, 3) if it has colours.
+
+    A photograph's codes are decoded: by the file's ICC profile, sRGB mark or gamma; without them,
+    integers of 8 bit are sRGB, those of 16 bit and floats are linear. `linear=True` decodes
+    nothing: for data, such as a mask's levels, and for codes that are to be taken as light. The
+    image is turned upright, as its orientation (EXIF, TIFF) says.
 
     Unsigned integers of any depth are divided by their largest value, floats must be in [0, 1]
-    already. An alpha channel is dropped, not blended. No gamma is undone.
+    already. An alpha channel is dropped, not blended.
 
     Raises FileNotFoundError if there is no such file; ValueError for a folder, a file that is no
     image or is damaged, an empty image, a stack of several, or values out of range.
@@ -48,7 +59,7 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
 
     PIL.Image.fromarray(np.full((2, 3), 51, np.uint8)).save("photo.png")
     image = tc.load_image("photo.png")
-    print(image.shape, image.max())  # (2, 3) 0.2
+    print(image.shape, image.max().round(4))  # (2, 3) 0.0331
     ```
 
     **See also**: `ImagePlane`, `read_mask`.
@@ -62,9 +73,8 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            data = io.BytesIO(read_whole(path, kind := kind_of(path)))
-            read = tifffile.imread if kind == "tiff" else skimage.io.imread
-            pixels = np.asarray(read(data))
+            data = read_whole(path, kind := kind_of(path))
+            pixels, tags, orientation = (_read_tiff if kind == "tiff" else _read_other)(data)
     except ImageFileError as error:
         raise ValueError(f"{str(path)!r} {error}") from None
     except Exception as error:  # each decoder raises its own kind
@@ -73,14 +83,44 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
             f"{str(path)!r} cannot be read as an image ({reason}); give an undamaged "
             "PNG, TIFF or JPEG"
         ) from error
-    return _unit_range(_without_alpha(pixels, path), path)
+    codes = upright(_unit_range(_without_alpha(pixels, path), path), orientation)
+    return codes if linear else decoded(codes, tags, pixels.dtype == np.uint8)
+
+
+def _read_tiff(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
+    """Pixels as stored, tags of their encoding, and their orientation."""
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = file.pages[0].aspage()
+        if page.photometric in (3, 5):  # a palette, inks
+            return _read_other(data)
+        pixels, found = file.asarray(), page.tags.get(ORIENTATION)
+        tags = {"icc_profile": page.tags.valueof("InterColorProfile")}
+    if page.photometric == 0 and pixels.dtype.kind == "u":
+        pixels = np.iinfo(pixels.dtype).max - pixels
+    return pixels, tags, found.value if found else 1
+
+
+def _read_other(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
+    with PIL.Image.open(io.BytesIO(data)) as file:
+        tags: dict[Any, Any] = file.info
+        orientation = file.getexif().get(ORIENTATION, 1)
+        if file.mode in ("CMYK", "P") and file.format in ("JPEG", "TIFF"):
+            turned = file.format == "TIFF"  # by Pillow
+            return np.asarray(file.convert("RGB")), tags, 1 if turned else orientation
+    if data[:4] == b"\x89PNG" and png_header(data)[2:4] in ((16, 2), (16, 6)):
+        with contextlib.suppress(ImportError):  # without, 8 of the 16 bits
+            import imagecodecs
+
+            return imagecodecs.png_decode(data), tags, orientation
+    return np.asarray(skimage.io.imread(io.BytesIO(data))), tags, orientation
 
 
 @checked
-def sample_image(name: str) -> Float64[np.ndarray, "y x *channel"]:
-    """One of scikit-image's sample pictures as float64 in [0, 1], (y, x) or (y, x, 3).
+def sample_image(name: str, *, linear: bool = False) -> Float64[np.ndarray, "y x *channel"]:
+    """One of scikit-image's sample pictures by `load_image`: (y, x) or (y, x, 3), 0 to 1.
 
-    Only those whose file is installed with scikit-image, so that nothing is downloaded;
+    With `linear=True` its codes are taken as light, as in published comparisons. Only those whose
+    file is installed with scikit-image, so that nothing is downloaded;
     `sample_images()` lists them. Raises ValueError for another name, with that list.
     """
     available = sample_images()
@@ -89,7 +129,7 @@ def sample_image(name: str) -> Float64[np.ndarray, "y x *channel"]:
             f"name = {name!r} is not a sample image; choose one of {', '.join(available)}"
         )
     with resources.as_file(resources.files("skimage.data") / _SAMPLES[name]) as path:
-        return load_image(path)
+        return load_image(path, linear=linear)
 
 
 def sample_images() -> tuple[str, ...]:

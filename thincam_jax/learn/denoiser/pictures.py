@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from thincam_jax.imaging.encoding import decode_srgb
 from thincam_jax.imaging.targets import resize
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.learn.refocusing.sources import Entry, linear_light, read_photographs, read_samples
+from thincam_jax.learn.refocusing.sources import Entry, read_photographs, read_samples
 
 TILE = 192  # pixels
 # Reduced photographs are sharper and hold less noise of their own; each halves the number of tiles.
@@ -75,7 +76,7 @@ def split(
 
 def _pictures(image: np.ndarray, entry: Entry) -> Pictures:
     """Tiles that cover an image at each scale at which it holds one."""
-    linear = linear_light(image if image.ndim == 3 else np.stack([image] * 3, axis=-1))
+    linear = decode_srgb(image if image.ndim == 3 else np.stack([image] * 3, axis=-1))
     tiles: list[np.ndarray] = []
     for scale in _SCALES:
         rows, columns = (round(scale * side) for side in linear.shape[:2])

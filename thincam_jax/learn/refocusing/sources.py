@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from thincam_jax._core.files import file_digest, read_regular
+from thincam_jax.imaging.encoding import decode_srgb
 from thincam_jax.imaging.targets import load_image, middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 
@@ -73,7 +74,9 @@ def read_photographs(
         raise ValueError(f"{str(folder)!r} holds no image; give a folder of {', '.join(_SUFFIXES)}")
     licence = licence or _licence(folder)
     entries = [Entry(path.name, file_digest(path), licence) for path in files]
-    return [(load_image(path), entry) for path, entry in zip(files, entries, strict=True)]
+    return [
+        (load_image(path, linear=True), entry) for path, entry in zip(files, entries, strict=True)
+    ]
 
 
 def samples(side: int) -> Source:
@@ -84,7 +87,7 @@ def samples(side: int) -> Source:
 
 def read_samples() -> list[tuple[np.ndarray, Entry]]:
     """scikit-image's own photographs as in their files, from 0 to 1."""
-    images = [sample_image(name) for name in _SAMPLES]
+    images = [sample_image(name, linear=True) for name in _SAMPLES]
     digests = [hashlib.sha256(image.tobytes()).hexdigest() for image in images]
     licence = "scikit-image's own (its data folder's README)"
     named = zip(_SAMPLES, digests, strict=True)
@@ -99,13 +102,8 @@ def drawn(seed: int, count: int, side: int) -> Source:
     return Source(images, (Entry(f"dead leaves, seed {seed}, {count} images", digest, "drawn"),))
 
 
-def linear_light(encoded: np.ndarray) -> np.ndarray:
-    """Radiance of sRGB values from 0 to 1 (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
 def _square(image: np.ndarray, side: int) -> Float32[np.ndarray, "side side"]:
-    linear = linear_light(image)
+    linear = decode_srgb(image)
     if linear.ndim == 3:
         linear = linear @ np.array([0.2126, 0.7152, 0.0722])  # luminance of sRGB's primaries
     square = middle_square(linear, min(linear.shape))

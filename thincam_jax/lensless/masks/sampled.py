@@ -199,7 +199,7 @@ def read_mask(path: str | os.PathLike[str], cell: Number) -> SampledMask:
     # Here: a camera waits for no library that reads files.
     from thincam_jax.imaging.targets.images import load_image
 
-    levels = load_image(path)
+    levels = load_image(path, linear=True)
     if levels.ndim == 3 and np.ptp(levels, axis=-1).max() > 0:
         raise ValueError(f"{str(path)!r} is coloured; give a grey image, white where it is open")
     levels = levels if levels.ndim == 2 else levels[..., 0]

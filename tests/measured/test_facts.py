@@ -1,0 +1,161 @@
+"""What a raw file says of its sensor is used, and contradictions are refused."""
+
+import io
+import logging
+
+import numpy as np
+import PIL.Image
+import pytest
+import tifffile
+
+from thincam_jax.commands.reconstruct.options import Sources
+from thincam_jax.commands.reconstruct.run import Rig
+from thincam_jax.imaging.encoding import ORIENTATION, upright
+from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare, read_image
+from thincam_jax.measured.bayer import colour_sites, mosaic
+from thincam_jax.measured.options import by_files
+
+SHAPE, BLACK, WHITE = (36, 52), 256, 4095
+RNG = np.random.default_rng(0)
+COLOURS = RNG.uniform(100, 3000, (3, *SHAPE)) * np.array([1.0, 0.7, 0.3])[:, None, None]
+
+
+def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE):
+    """A DNG 1.4 whose pixels lie as its orientation says."""
+    inverse = {6: 8, 8: 6}.get(orientation, orientation)
+    pixels = upright(np.rint(mosaic(light, pattern)).astype(np.uint16) + black, inverse)
+    letters = np.select(list(colour_sites(SHAPE, pattern).values()), list("RGB"), "")
+    sites = ["RGB".index(letter) for letter in upright(letters, inverse)[:2, :2].ravel()]
+    identity = [part for value in np.eye(3, dtype=int).ravel() for part in (int(value), 1)]
+    tags = [
+        (50706, 1, 4, (1, 4, 0, 0), True),
+        (50708, 2, 0, "Test camera", True),
+        (33421, 3, 2, (2, 2), True),
+        (33422, 1, 4, tuple(sites), True),
+        (50721, 10, 9, identity, True),
+        (50714, 4, 1, black, True),
+        (50717, 4, 1, white, True),
+        (50728, 5, 3, (1,) * 6, True),
+        (50778, 3, 1, 21, True),
+        (ORIENTATION, 3, 1, orientation, True),
+    ]
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, np.ascontiguousarray(pixels), photometric=32803, extratags=tags)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("suffix", ["dng", "tif"])
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_pattern_levels_and_orientation(tmp_path, suffix, pattern, orientation):
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(dng(pattern, orientation))
+    raw = read_image(path)
+    assert (raw.bayer, raw.black_level, raw.white_level) == (pattern, BLACK, WHITE)
+    assert (raw.bits, raw.full_scale) == (12, WHITE)
+    expected = np.rint(mosaic(COLOURS, pattern)) + BLACK
+    np.testing.assert_array_equal(raw.pixels, expected)
+
+
+@pytest.fixture
+def files(tmp_path):
+    point = np.zeros((3, *SHAPE))
+    point[:, 14:20, 20:30] = 1500
+    for name, light in (("psf", point), ("capture", COLOURS)):
+        (tmp_path / f"{name}.dng").write_bytes(dng("BGGR", light=light))
+    return tmp_path / "psf.dng", tmp_path / "capture.dng"
+
+
+def test_a_dng_works_by_default(files):
+    psf, capture = files
+    found = Rig(Sources(psf)).prepare(capture)
+    raws = read_image(psf), read_image(capture)
+    expected = prepare(*raws, BLACK, Preparation(bayer="BGGR"))
+    np.testing.assert_array_equal(found.capture, expected.capture)
+    np.testing.assert_array_equal(found.psf, expected.psf)
+    assert found.log.options.bayer == "BGGR" and found.log.capture.background == "number"
+    means = found.capture.mean(axis=(1, 2))
+    assert means[0] > 1.2 * means[1] > 1.8 * means[2]  # red is red
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"preparation": Preparation(bayer="RGGB")}, "pattern BGGR, but bayer = 'RGGB'; give BGGR"),
+        ({"background": 64.0}, "black level of 256, not background = 64.0; give 256"),
+        ({"bits": 14}, "bits = 14, but the file says 12 bit .white level 4095.; leave `bits` out"),
+    ],
+)
+def test_contradictions_are_refused_with_both_values(files, given, message):
+    psf, capture = files
+    with pytest.raises(MeasurementError, match=message) as caught:
+        Rig(Sources(psf, **given)).prepare(capture)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_the_messages_advise(files):
+    psf, capture = files
+    given = {"preparation": Preparation(bayer="BGGR"), "background": 256.0, "bits": None}
+    found = Rig(Sources(psf, **given)).prepare(capture)
+    np.testing.assert_array_equal(found.capture, Rig(Sources(psf)).prepare(capture).capture)
+
+
+def test_facts_are_not_dropped_in_python(files):
+    """`prepare` asks for what it is not given; `by_files` gives it."""
+    raws = [read_image(path) for path in files]
+    with pytest.raises(MeasurementError, match="black level of 256, not a dark corner"):
+        prepare(*raws, options=Preparation(bayer="BGGR"))
+    with pytest.raises(MeasurementError, match="pattern BGGR, but nothing is given; give BGGR"):
+        prepare(*raws, 256)
+    assert prepare(*raws, **by_files(*raws)).capture.shape == (3, *SHAPE)
+
+
+def test_two_patterns(files):
+    psf, capture = files
+    psf.write_bytes(dng("RGGB"))
+    with pytest.raises(MeasurementError, match=r"says the pattern BGGR and the PSF's .* RGGB"):
+        Rig(Sources(psf)).prepare(capture)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_captures_are_turned_upright(tmp_path, orientation):
+    pixels = RNG.integers(0, 4000, (24, 40), dtype=np.uint16)
+    exif = PIL.Image.Exif()
+    exif[ORIENTATION] = orientation
+    PIL.Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
+    tags = [(ORIENTATION, 3, 1, orientation, True)]
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="minisblack", extratags=tags)
+    for name in ("a.png", "a.tif"):
+        np.testing.assert_array_equal(
+            read_image(tmp_path / name).pixels, upright(pixels, orientation)
+        )
+
+
+def test_nan_in_a_float_file_are_dead_pixels(tmp_path, caplog):
+    pixels = RNG.random(SHAPE).astype(np.float32)
+    holed = pixels.copy()
+    holed[4, 5] = holed[20, 31] = np.nan
+    psf = np.zeros(SHAPE, np.float32)
+    psf[16:20, 24:30] = 1
+    tifffile.imwrite(tmp_path / "psf.tif", psf)
+    tifffile.imwrite(tmp_path / "a.tif", holed)
+    np.save(tmp_path / "a.npy", holed)
+    for name in ("a.tif", "a.npy"):
+        with caplog.at_level(logging.WARNING):
+            raw = read_image(tmp_path / name)
+        assert f"{name}: 2 pixels are NaN or masked: taken as dead" in caplog.text
+        found = Rig(Sources(tmp_path / "psf.tif")).prepare(tmp_path / name)
+        np.testing.assert_array_equal(found.valid[0], ~np.isnan(holed))
+        assert found.log.capture.dead == 2
+        with pytest.raises(MeasurementError, match="has 2 NaN or masked pixels .* dead=raw.dead"):
+            prepare(read_image(tmp_path / "psf.tif"), raw)
+        assert not prepare(read_image(tmp_path / "psf.tif"), raw, dead=raw.dead).valid.all()
+
+
+def test_masked_arrays_and_infinite_values():
+    raw = Raw(np.ma.masked_array(np.ones(SHAPE, np.uint16), np.eye(*SHAPE)))
+    assert raw.dead is not None and raw.dead.sum() == 36
+    assert (raw.bits, raw.pixels.dtype) == (16, np.uint16)
+    for bad in (np.full(SHAPE, np.inf), np.full(SHAPE, np.nan)):
+        with pytest.raises(MeasurementError, match="values are NaN or infinite; give finite ones"):
+            Raw(bad)

@@ -1,0 +1,86 @@
+"""Encodings of light in image files: sRGB, powers, curves of ICC profiles, and orientation.
+
+A photograph's codes are about a square root of its light; a sensor's counts are linear. EXIF's tag
+of orientation (CIPA DC-008, 274) tells how the stored rows and columns lie in the picture.
+"""
+
+import contextlib
+import functools
+import logging
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+ORIENTATION = 274  # tag of EXIF and TIFF
+_MOST_TAGS = 100  # of a profile
+_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}  # of an ICC curve, by its kind
+
+
+def decode_srgb(codes: np.ndarray) -> np.ndarray:
+    """Light of sRGB values from 0 to 1 (IEC 61966-2-1)."""
+    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+
+
+def encode_srgb(light: np.ndarray) -> np.ndarray:
+    """SRGB values of light from 0 to 1 (IEC 61966-2-1)."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """An image (y, x, …) as it is to be seen, of the one that is stored with an orientation."""
+    if orientation in (5, 6, 7, 8):
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    return pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
+
+
+def decoded(codes: np.ndarray, tags: Mapping[str, Any], photograph: bool) -> np.ndarray:
+    """Light of codes from 0 to 1, by the file's ICC profile, sRGB mark or gamma.
+
+    - `tags`: as of Pillow: `icc_profile`, `srgb`, `gamma`. Without them the codes of a `photograph`
+      are sRGB, others are linear.
+    """
+    if profile := tags.get("icc_profile"):
+        with contextlib.suppress(struct.error, KeyError), np.errstate(all="ignore"):
+            light = _by_profile(codes, profile)
+            if np.isfinite(light).all():
+                return np.clip(light, 0, 1)
+    if "srgb" in tags:
+        return decode_srgb(codes)
+    if gamma := tags.get("gamma"):
+        return codes ** (1 / gamma)
+    if photograph:
+        say_once()
+    return decode_srgb(codes) if photograph else codes
+
+
+@functools.cache
+def say_once() -> None:
+    logging.getLogger(__name__).info(
+        "photographs of 8 bit are decoded from sRGB to linear light; linear=True leaves their codes"
+    )
+
+
+def _by_profile(codes: np.ndarray, profile: bytes) -> np.ndarray:
+    """By the curve of red or grey of a profile (ICC.1, 10.6 and 10.18)."""
+    (count,) = struct.unpack_from(">I", profile, 128)
+    places = range(132, 132 + 12 * min(count, _MOST_TAGS), 12)
+    tags = {profile[p : p + 4]: struct.unpack_from(">II", profile, p + 4) for p in places}
+    place, size = tags[b"rTRC" if b"rTRC" in tags else b"kTRC"]
+    curve = profile[place : place + size]
+    if curve[:4] == b"curv":
+        (count,) = struct.unpack_from(">I", curve, 8)
+        numbers = struct.unpack_from(f">{count}H", curve, 12)
+        if count < 2:
+            return codes ** (numbers[0] / 256) if count else codes
+        return np.interp(codes, np.linspace(0, 1, count), np.array(numbers) / 65535)
+    kind = struct.unpack_from(">H", curve, 8)[0] if curve[:4] == b"para" else -1
+    numbers = np.array(struct.unpack_from(f">{_PARAMETERS[kind]}i", curve, 12)) / 65536
+    power, a, b, c, d, e, f = (*numbers, *(1, 0, 0, 0, 0, 0)[len(numbers) - 1 :])
+    if kind in (1, 2):  # c is added on both sides of −b/a
+        c, d, e, f = 0.0, -b / a, c, c
+    bent = np.maximum(a * codes + b, 0) ** power + e
+    return bent if kind == 0 else np.where(codes >= d, bent, c * codes + f)
