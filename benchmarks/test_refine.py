@@ -9,6 +9,7 @@ maximum is unknown. PSFs are measured: 12 bit, shot noise. `THINCAM_COUNT` (4) p
 
 import os
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
@@ -54,7 +55,7 @@ def random_mask(generator, size):
 def sampled(kind, seed, *, scale=1.0, turn=0.0, blur=0.0):
     """A PSF that ends on the sensor, of unit sum; turned anticlockwise."""
     pattern = kind(np.random.default_rng(seed), [int(1.3 * n * FINE) for n in SHAPE])
-    y, x = np.meshgrid(*((np.arange(n) - (n - 1) / 2 for n in SHAPE)), indexing="ij")
+    y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in SHAPE), indexing="ij")
     cos, sin = np.cos(turn), np.sin(turn)
     v, u = (cos * y + sin * x) / scale, (cos * x - sin * y) / scale
     place = [FINE * a + (n - 1) / 2 for a, n in zip((v, u), pattern.shape, strict=True)]
@@ -80,9 +81,9 @@ def camera(distance=4.0, object_distance=25.0):
 def exposed(model, image, seed):
     """A capture through a PSF, with noise and an unknown background."""
     operator = tc.Recording(np.ones((1, *SHAPE)), model).problem().operators[0]
-    margins = [(n - s) // 2 for n, s in zip(operator.in_shape[-2:], SHAPE, strict=True)]
-    field = np.pad(image, [(m, n - s - m) for m, n, s in zip(margins, operator.in_shape[-2:], SHAPE, strict=True)])
-    clean = np.asarray(operator(field[None, None]))
+    sizes = zip(operator.in_shape[-2:], SHAPE, strict=True)
+    field = np.pad(image, [((n - s) // 2, n - s - (n - s) // 2) for n, s in sizes])
+    clean = np.asarray(operator(jnp.asarray(field[None, None])))
     generator, snr = np.random.default_rng(seed), (30, 35, 40)[seed % 3]
     noise = clean.std() * 10 ** (-snr / 20) * generator.normal(size=clean.shape)
     return clean + 0.1 * clean.max() + noise
@@ -90,7 +91,8 @@ def exposed(model, image, seed):
 
 def score(model, capture, image, *, turned):
     """PSNR of a reconstruction by the default after the best gain and offset."""
-    found = np.asarray(tc.reconstruct(tc.Recording(capture, model), tc.AdmmTV()).image)[0]
+    found = np.asarray(tc.reconstruct(tc.Recording(capture, model), tc.AdmmTV()).image)
+    found = found.reshape(image.shape)
     truth = image[::-1, ::-1] if turned else image
     return float(psnr(align(found, truth)[0], truth))
 

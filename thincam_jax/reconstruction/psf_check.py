@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
@@ -263,8 +264,9 @@ class Trials:
             lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
         )
 
-    def blocks(self, values: Float[np.ndarray, "*batch y x"]) -> Float[np.ndarray, "*batch block"]:
+    def blocks(self, values: Numbers) -> Float[np.ndarray, "*batch block"]:
         """Sums over blocks of pixels."""
+        values = np.asarray(values)
         shape = values.shape[-2:]
         rows, columns = (-(-n // self.block) * self.block for n in shape)
         padded = np.zeros((*values.shape[:-2], rows, columns))

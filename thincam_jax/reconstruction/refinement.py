@@ -39,7 +39,7 @@ _TOLD = 1 / 3  # of the range searched: the largest standard error of a number t
 _SIGNIFICANCE = 2.0  # standard errors by which hidden pixels must be predicted better
 
 _TURN, _SHIFT, _BLUR = 0.035, 3.0, 1.0  # ranges searched: rad, pixels, pixels²
-# Standard error at the least, pixels²: total variation smooths images, which a PSF too sharp undoes.
+# Standard error of a blur at the least, pixels²: total variation blurs, a sharper PSF undoes it.
 _BLUR_ERROR = 0.2
 _OF_PSFS, _OF_CAMERAS = ("scale", "turn", "shift", "blur"), ("distance", "object_distance")
 
@@ -191,46 +191,37 @@ def refine(
     if not names or not set(names) <= set(possible):
         raise ValueError(f"parameters = {list(names)}; give some of {', '.join(possible)}")
     unknowns, reasons = _unknowns(model, names, search)
-    search_for = _Search(recording, float(tau), unknowns, callback)
-    given = search_for.given
-    before = search_for.residual(given, None, _COLD)
-    start = search_for.coarse(max(shape)) if "scale" in names else given
-    active = []
-    for k, unknown in enumerate(unknowns):
-        if search_for.steps[k] > 0:
-            active.append(k)
-        else:
-            reasons[unknown.name] = "the PSF hardly depends on it"
-    fit = None
+    work = _Search(recording, float(tau), unknowns, callback)
+    before = _Fit(work.given, np.zeros(0), work.residual(work.given, None, _COLD))
+    active = [k for k, step in enumerate(work.steps) if step > 0]
+    for k in set(range(len(unknowns))).difference(active):
+        reasons[unknowns[k].name] = "the PSF hardly depends on it"
+    start = work.coarse(2 / max(shape)) if "scale" in names else work.given
+    fit = before
     while active:
-        fit = search_for.fit(start, active)
-        ranges = np.array([unknowns[k].search for k in active])
-        away = np.abs(fit.values - given)[active]
-        doubts = np.maximum(fit.errors / (_TOLD * ranges), away / ranges)
-        for k, blur in enumerate(unknowns[n].name == "blur" for n in active):
-            doubts[k] += blur and away[k] < 2 * fit.errors[k]
-        worst = int(np.argmax(doubts))
-        if doubts[worst] <= 1:
+        fit = work.fit(start, active)
+        worst, reason = work.doubt(fit, active)
+        if not reason:
             break
-        unknown = unknowns[active.pop(worst)]
-        reasons[unknown.name] = _reason(unknown, away[worst], fit.errors[worst])
-        start = np.where(np.isin(np.arange(len(given)), active), fit.values, given)
-        fit = None
-    gains = np.zeros(1) if fit is None else search_for.gains(before, fit.residual)
-    better = np.sum(gains) > _SIGNIFICANCE * math.sqrt(gains.size) * np.std(gains) > 0
-    ratios = [math.sqrt(np.sum(r**2) / search_for.pixels) for r in (before, before)]
-    if fit is not None and better:
-        ratios[1] = math.sqrt(np.sum(fit.residual**2) / search_for.pixels)
-        recording = replace(recording, imaging_model=search_for.model(fit.values))
-    told = {} if fit is None else {unknowns[k].name: k for k in active}
+        reasons[unknowns[active[worst]].name] = reason
+        start = fit.values.copy()
+        start[active[worst]] = work.given[active[worst]]
+        del active[worst]
+        fit = before
+    gains = work.blocks(before.residual**2 - fit.residual**2).ravel()
+    better = bool(np.sum(gains) > _SIGNIFICANCE * math.sqrt(gains.size) * np.std(gains) > 0)
+    if better:
+        recording = replace(recording, imaging_model=work.model(fit.values))
+    told = [unknowns[k] for k in active]
     return Refinement(
         recording,
-        {name: float(fit.values[k]) for name, k in told.items() if fit is not None},
-        {name: float(e) for name, e in zip(told, () if fit is None else fit.errors, strict=True)},
-        {name: unknowns[k].unit for name, k in told.items()},
+        {u.name: float(fit.values[k]) for u, k in zip(told, active, strict=True)},
+        {u.name: float(error) for u, error in zip(told, fit.errors, strict=True)},
+        {u.name: u.unit for u in told},
         reasons,
-        *ratios,
-        bool(better),
+        work.noise_ratio(before),
+        work.noise_ratio(fit if better else before),
+        better,
     )
 
 
@@ -263,64 +254,60 @@ class _Search(Trials):
         """(H f − g)/σ of each pixel, f from the half without it; leaves the two `images`."""
         problem = self.problem(self.model(values))
         problem = eqx.tree_at(lambda p: p.tau, problem, jnp.full_like(problem.tau, tau or self.tau))
-        found, self.images = 0, []
         schedule = Schedule(iterations, 1e-6, adapt_until=iterations // 2)
+        found, self.images = [], []
         for number, masks in enumerate(self.halves):
-            weights = tuple(w * m for w, m in zip(self.weights, masks, strict=True))
+            pairs = zip(self.weights, masks, strict=True)
+            weights = tuple(w * m.astype(w.dtype) for w, m in pairs)
             half = eqx.tree_at(lambda p: p.weights, problem, weights)
             first = first_image(half, None, uniform=False) if starts is None else starts[number]
             image = iterate(in_parallel(half, admm_method), first, schedule).image
-            missing = zip(self.weights, masks, _residuals(half, image), strict=True)
-            found = found + np.concatenate(
-                [
-                    np.asarray(jnp.where(m, 0, jnp.sqrt(w) * r), float).reshape(-1, *r.shape[-2:])
-                    for w, m, r in missing
-                ]
-            )
+            missing = _residuals(half, image)
+            parts = zip(self.weights, masks, missing, strict=True)
+            hidden = [np.where(m, 0, np.sqrt(w) * np.asarray(r, float)) for w, m, r in parts]
+            found.append(np.concatenate([h.reshape(-1, *h.shape[-2:]) for h in hidden]))
             self.images.append(image)
         self.done += 2
         if self.callback is not None:
             self.callback(self.done)
-        return found
+        return found[0] + found[1]
 
     @cached_property
     def steps(self) -> np.ndarray:
-        """Of the differences: such that the PSF changes as much by each number; 0 if it hardly does."""
+        """Steps of the differences: the PSF changes as much by each; 0 if it hardly does."""
         kernel = self._kernel(self.given)
-        steps = []
-        for k, unknown in enumerate(self.unknowns):
-            most = unknown.search / 2
-            values = self.given.copy()
-            values[k] += most / 8
-            small = np.linalg.norm(self._kernel(values) - kernel) / np.linalg.norm(kernel)
-            step = most / 8 * min(_CHANGE / max(small, 1e-9), 8.0)
-            steps.append(step if 8 * small > _UNCHANGED else 0.0)
-        return np.array(steps)
+        small = np.array([u.search for u in self.unknowns]) / 16
+        changes = [np.linalg.norm(self._kernel(self.given + d) - kernel) for d in np.diag(small)]
+        change = np.array(changes) / np.linalg.norm(kernel)
+        steps = small * np.minimum(_CHANGE / np.maximum(change, 1e-9), 8.0)
+        return np.where(8 * change > _UNCHANGED, steps, 0.0)
 
-    def coarse(self, side: int) -> np.ndarray:
+    def coarse(self, pixel: float) -> np.ndarray:
         """The best of scales a pixel apart at the edge."""
         k = [u.name for u in self.unknowns].index("scale")
-        pixel = 2 / side
         count = math.ceil(self.unknowns[k].search / pixel)
-        tried = [self._at(k, 1 + n * pixel) for n in range(-count, count + 1)]
-        return min(tried, key=lambda v: np.sum(self.residual(v, None, _WARM) ** 2))
+        along = pixel * np.eye(len(self.given))[k]
+        tried = [self.given + n * along for n in range(-count, count + 1)]
+        return min(tried, key=lambda values: np.sum(self.residual(values, None, _WARM) ** 2))
 
     def fit(self, values: np.ndarray, active: list[int]) -> _Fit:
         """Least squares of some numbers by Gauss and Newton, and their errors."""
         residual = self.residual(values, None, _COLD)
         images, steps = self.images, self.steps[active]
         ranges = np.array([self.unknowns[k].search for k in active])
-        for _ in range(_STEPS):
+        left = _STEPS
+        while True:
             slopes = self._slopes(values, active, images)
             prior = np.mean(residual**2) / ranges**2
             inverse = np.linalg.inv(slopes @ slopes.T + np.diag(prior))
             pull = slopes @ residual.ravel() + prior * (values - self.given)[active]
             move = -inverse @ pull
             move /= max(1.0, np.max(np.abs(move) / (2 * steps)))
-            if np.all(np.abs(move) < _ENDED * steps):
-                break
             moved = values.copy()
             moved[active] += move
+            left -= 1
+            if not left or np.all(np.abs(move) < _ENDED * steps):
+                break
             found = self.residual(moved, images, _NEARBY)
             if np.sum(found**2) >= np.sum(residual**2):
                 break
@@ -335,24 +322,37 @@ class _Search(Trials):
         errors = np.sqrt(np.diag(covariance) + by_tau**2 + np.square(least))
         return _Fit(values, errors, residual)
 
-    def gains(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """By how much each block is predicted better."""
-        return self.blocks((before**2 - after**2) / 2).ravel()
+    def noise_ratio(self, fit: _Fit) -> float:
+        """The rms of the residual of hidden pixels over the noise."""
+        return math.sqrt(np.sum(fit.residual**2) / self.pixels)
+
+    def doubt(self, fit: _Fit, active: list[int]) -> tuple[int, str]:
+        """The number that is told worst, and why it is not told; nothing if all are."""
+        unknowns = [self.unknowns[k] for k in active]
+        limits = np.array([u.search for u in unknowns])
+        away = np.abs(fit.values - self.given)[active]
+        none = [
+            u.name == "blur" and a < 2 * e
+            for u, a, e in zip(unknowns, away, fit.errors, strict=True)
+        ]
+        doubts = np.maximum(fit.errors / (_TOLD * limits), away / limits) + none
+        worst = int(np.argmax(doubts))
+        unknown, error = unknowns[worst], fit.errors[worst]
+        found = f"{fit.values[active[worst]]:.4g} ± {error:.2g} {unknown.unit}".rstrip()
+        if doubts[worst] <= 1:
+            return worst, ""
+        if error > _TOLD * unknown.search:
+            return worst, f"the captures do not tell it: {found}"
+        return worst, f"{found} " + (
+            "is no more than none" if none[worst] else "is beyond the search"
+        )
 
     def _slopes(self, values, active, images) -> Float[np.ndarray, "unknown number"]:
         found = []
-        for k in active:
-            above, below = (
-                self.residual(self._at(k, values[k] + sign * self.steps[k], values), images, _WARM)
-                for sign in (1, -1)
-            )
-            found.append((above - below).ravel() / (2 * self.steps[k]))
+        for step in np.diag(self.steps)[active]:
+            above, below = (self.residual(values + s * step, images, _WARM) for s in (1, -1))
+            found.append((above - below).ravel() / (2 * np.sum(step)))
         return np.stack(found)
-
-    def _at(self, k: int, value: float, values: np.ndarray | None = None) -> np.ndarray:
-        moved = (self.given if values is None else values).copy()
-        moved[k] = value
-        return moved
 
     def _kernel(self, values: np.ndarray) -> np.ndarray:
         leaves = jax.tree.leaves(self.problem(self.model(values)).operators)
@@ -373,8 +373,7 @@ def _unknowns(
         "blur": _Unknown("blur", "pixels²", 0.0, _BLUR),
     }
     if isinstance(model, Cameras):
-        furthest = max(float(camera.distance) for camera in model.cameras)
-        focus = float(np.ravel(np.asarray(model.object_distance, float))[0])
+        furthest, focus = _distances(model)
         known = {
             "distance": _Unknown("distance", "mm", furthest, search * furthest),
             "object_distance": _Unknown("object_distance", "mm", focus, search * focus),
@@ -395,51 +394,40 @@ def _unknowns(
     return found, reasons
 
 
-def _reason(unknown: _Unknown, away: float, error: float) -> str:
-    unit = f" {unknown.unit}" if unknown.unit else ""
-    if error > _TOLD * unknown.search:
-        return f"the captures tell it only within {error:.2g}{unit}"
-    if away <= unknown.search:
-        return f"{away:.2g} ± {error:.2g}{unit}, not told from none"
-    return f"it ends beyond {unknown.search:.2g}{unit} from the one given: it is not what is wrong"
-
-
 def _moved(model: Psfs | Cameras, values: dict[str, float]) -> Psfs | Cameras:
     """An imaging model with other numbers."""
     if isinstance(model, Cameras):
-        furthest = max(float(camera.distance) for camera in model.cameras)
+        furthest, focus = _distances(model)
         ratio = values.get("distance", furthest) / furthest
         cameras = [replace(c, distance=float(c.distance) * ratio) for c in model.cameras]
-        focus = np.asarray(model.object_distance, float)
-        focus = focus * (values.get("object_distance", focus.ravel()[0]) / focus.ravel()[0])
-        return replace(model, cameras=cameras, object_distance=focus if focus.ndim else float(focus))
-    shape = {name: values.get(name, start) for name, start in _AS_GIVEN.items()}
-    moved = [
-        changed_psf(
-            np.asarray(psf),
-            **shape,
-            shift=(values.get(f"shift_y {n}", 0.0), values.get(f"shift_x {n}", 0.0)),
-        )
-        for n, psf in enumerate(model.psfs, start=1)
+        if "object_distance" not in values:
+            return replace(model, cameras=cameras)
+        planes = np.asarray(model.object_distance, float) * (values["object_distance"] / focus)
+        focus = planes if planes.ndim else float(planes)
+        return replace(model, cameras=cameras, object_distance=focus)
+    shifts = [
+        (values.get(f"shift_y {n}", 0.0), values.get(f"shift_x {n}", 0.0))
+        for n in range(1, model.count + 1)
     ]
-    return replace(model, psfs=np.stack(moved))
+    pairs = zip(np.asarray(model.psfs), shifts, strict=True)
+    return replace(model, psfs=np.stack([changed_psf(psf, values, s) for psf, s in pairs]))
 
 
-_AS_GIVEN = {"scale": 1.0, "turn": 0.0, "blur": 0.0}
+def _distances(model: Cameras) -> tuple[float, float]:
+    """The largest mask-sensor distance, and the object distance of the first plane."""
+    distances = [float(camera.distance) for camera in model.cameras]
+    return max(distances), float(np.ravel(np.asarray(model.object_distance, float))[0])
 
 
 def changed_psf(
     psf: Float[np.ndarray, "*batch k l"],
-    *,
-    scale: float = 1.0,
-    turn: float = 0.0,
-    blur: float = 0.0,
+    values: dict[str, float],
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> Float[np.ndarray, "*batch k l"]:
-    """A PSF enlarged, turned anticlockwise (rad), shifted (pixels) and blurred, with its sum.
-
-    - `blur`: variance of a Gaussian, pixels²; a negative one sharpens.
-    """
+    """A PSF by a `Refinement`'s scale, turn and blur, then shifted by pixels, with its sum."""
+    scale, turn, blur = (
+        values.get(n, v) for n, v in (("scale", 1.0), ("turn", 0.0), ("blur", 0.0))
+    )
     if (scale, turn, blur, *shift) == (1.0, 0.0, 0.0, 0.0, 0.0):
         return psf
     planes = psf.reshape(-1, *psf.shape[-2:]).astype(float)
