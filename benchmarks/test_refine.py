@@ -138,15 +138,20 @@ def test_measured(kind, wrong, capsys):
         right = tc.Psfs(sampled(kind, number)[None])
         given = measured(sampled(kind, number, scale=1 / (1 + wrong), turn=-turn), number)
         runs.append(run(right, given, number, {"scale": 1 + wrong, "turn": turn}))
-        gain = runs[-1][2][1] - runs[-1][2][0]
-        assert gain > (0 if wrong else -0.1)
     with capsys.disabled():
         for name, start, unit in (
             ("scale", f"{100 * wrong:g} %", 0.01),
             ("turn", f"{np.rad2deg(turn):g}°", np.deg2rad(1)),
         ):
             print(f"\n| {kind.__name__} | {report(name, runs, start, unit)} |", end="")
-        print("\n", [r[0].not_told for r in runs], [r[2] for r in runs])
+    check(runs, is_wrong=bool(wrong))
+
+
+def check(runs, *, is_wrong):
+    """A right PSF stays as good, a wrong one is better for a photograph held out."""
+    gains = [after - before for _, _, (before, after, _) in runs]
+    assert min(gains) > -0.1
+    assert not is_wrong or np.mean(gains) > 0
 
 
 @pytest.mark.parametrize("name", ["object_distance", "distance", "both"])
@@ -161,4 +166,3 @@ def test_computed(name, capsys):
         for one, value in wanted.items():
             if name in (one, "both"):
                 print(f"\n| zone aperture | {report(one, runs, '2 %', value / 100)} |", end="")
-        print("\n", [r[0].not_told for r in runs], [r[2] for r in runs])

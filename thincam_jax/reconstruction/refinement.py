@@ -250,7 +250,7 @@ class _Search(Trials):
         starts: list[Image] | None,
         iterations: int,
         tau: float | None = None,
-    ) -> Float[np.ndarray, "capture y x"]:
+    ) -> Float[np.ndarray, "capture v u"]:
         """(H f − g)/σ of each pixel, f from the half without it; leaves the two `images`."""
         problem = self.problem(self.model(values))
         problem = eqx.tree_at(lambda p: p.tau, problem, jnp.full_like(problem.tau, tau or self.tau))
