@@ -1,9 +1,4 @@
-r"""Refine an imaging model by captures: scale, turn, shift and blur of a PSF, a camera's distances.
-
-Hidden pixels judge: an image is reconstructed from a random half of the pixels, and predicts those
-of the other half. The objective of a reconstruction would prefer PSFs that are too sharp
-(docs/measured/refine.md has the comparison).
-"""
+"""Refine measured PSFs and computed cameras by captures (docs/measured/refine.md)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -58,15 +53,12 @@ class Refinement:
     - `noise_ratio_before`, `noise_ratio`: rms of the residual of hidden pixels over the noise.
 
     ```python
-    import jax.numpy as jnp
     import numpy as np
     import thincam_jax as tc
 
-    psfs = tc.Psfs(np.random.default_rng(0).random((1, 13, 13)) ** 6)
-    camera = tc.Recording(np.ones((1, 32, 40)), psfs).problem().operators[0]
-    chart = jnp.zeros(camera.in_shape).at[..., 12:20, 16:26].set(1.0)
-    recording = tc.Recording(np.asarray(camera(chart))[None], psfs, noise_variance=1e-4)
-    print(tc.refine(recording, parameters=["turn"]).is_changed)  # False
+    psf, seen = np.random.default_rng(0).random((2, 1, 32, 40))
+    recording = tc.Recording(seen, tc.Psfs(psf[..., :13, :13]), noise_variance=1e-4)
+    print(tc.refine(recording, parameters=["shift"]).is_changed)  # False
     ```
 
     **See also**: `refine`.
@@ -83,15 +75,13 @@ class Refinement:
 
     def __str__(self) -> str:
         """Residuals, numbers with their errors, and a line for each number that is not told."""
-        first = f"residual of hidden pixels {self.noise_ratio_before:.3f} times the noise"
-        if self.is_changed:
-            first += f", refined {self.noise_ratio:.3f}"
-        found = [
-            f"{name} {value:.5g} ± {self.errors[name]:.2g} {self.units[name]}".rstrip()
-            for name, value in self.values.items()
-        ]
-        last = [] if self.is_changed else ["no other fits better: unchanged"]
-        return "\n".join([first, *found, *(f"{n}: {r}" for n, r in self.not_told.items()), *last])
+        lines = [f"residual of hidden pixels {self.noise_ratio_before:.3f} times the noise"]
+        for name, value in self.values.items():
+            error, unit = self.errors[name], self.units[name]
+            lines.append(f"{name} {value:.5g} ± {error:.2g} {unit}".rstrip())
+        lines += [f"{name}: {reason}" for name, reason in self.not_told.items()]
+        last = f"refined {self.noise_ratio:.3f} times" if self.is_changed else "unchanged"
+        return "\n".join([*lines, last])
 
 
 @dataclass(frozen=True)
@@ -161,16 +151,13 @@ def refine(
     range; TypeError inside jit.
 
     ```python
-    import jax.numpy as jnp
     import numpy as np
     import thincam_jax as tc
 
-    psfs = tc.Psfs(np.random.default_rng(0).random((1, 13, 13)) ** 6)
-    camera = tc.Recording(np.ones((1, 32, 40)), psfs).problem().operators[0]
-    chart = jnp.zeros(camera.in_shape).at[..., 12:20, 16:26].set(1.0)
-    recording = tc.Recording(np.asarray(camera(chart))[None], psfs, noise_variance=1e-4)
-    found = tc.refine(recording, parameters=["turn"])
-    print(abs(found.values["turn"]) < 0.01)  # True
+    psf, seen = np.random.default_rng(0).random((2, 1, 32, 40))
+    recording = tc.Recording(seen, tc.Psfs(psf[..., :13, :13]), noise_variance=1e-4)
+    found = tc.refine(recording, parameters=["shift"])
+    print(found.not_told["shift"])  # one capture cannot tell it: the scene shifts instead
     ```
 
     **See also**: `check_psf`, `fit_psf`.
@@ -212,17 +199,14 @@ def refine(
     better = bool(np.sum(gains) > _SIGNIFICANCE * math.sqrt(gains.size) * np.std(gains) > 0)
     if better:
         recording = replace(recording, imaging_model=work.model(fit.values))
-    told = [unknowns[k] for k in active]
-    return Refinement(
-        recording,
-        {u.name: float(fit.values[k]) for u, k in zip(told, active, strict=True)},
-        {u.name: float(error) for u, error in zip(told, fit.errors, strict=True)},
-        {u.name: u.unit for u in told},
-        reasons,
-        work.noise_ratio(before),
-        work.noise_ratio(fit if better else before),
-        better,
+    told = [unknowns[k].name for k in active]
+    first, last = (
+        math.sqrt(np.sum(f.residual**2) / work.pixels) for f in (before, fit if better else before)
     )
+    values, errors = fit.values[active].tolist(), fit.errors.tolist()
+    values, errors = (dict(zip(told, each, strict=True)) for each in (values, errors))
+    units = {unknowns[k].name: unknowns[k].unit for k in active}
+    return Refinement(recording, values, errors, units, reasons, first, last, better)
 
 
 class _Search(Trials):
@@ -318,34 +302,23 @@ class _Search(Trials):
         covariance = inverse @ (spread + np.diag(prior)) @ inverse
         rough, fine = (self.residual(values, images, _NEARBY, self.tau * f) for f in (2, 0.5))
         by_tau = inverse @ (slopes @ (rough - fine).ravel()) / 2
-        least = [_BLUR_ERROR * (self.unknowns[k].name == "blur") for k in active]
-        errors = np.sqrt(np.diag(covariance) + by_tau**2 + np.square(least))
-        return _Fit(values, errors, residual)
-
-    def noise_ratio(self, fit: _Fit) -> float:
-        """The rms of the residual of hidden pixels over the noise."""
-        return math.sqrt(np.sum(fit.residual**2) / self.pixels)
+        is_blur = np.array([self.unknowns[k].name == "blur" for k in active])
+        variance = np.diag(covariance) + by_tau**2 + _BLUR_ERROR**2 * is_blur
+        return _Fit(values, np.sqrt(variance), residual)
 
     def doubt(self, fit: _Fit, active: list[int]) -> tuple[int, str]:
         """The number that is told worst, and why it is not told; nothing if all are."""
         unknowns = [self.unknowns[k] for k in active]
         limits = np.array([u.search for u in unknowns])
         away = np.abs(fit.values - self.given)[active]
-        none = [
-            u.name == "blur" and a < 2 * e
-            for u, a, e in zip(unknowns, away, fit.errors, strict=True)
-        ]
-        doubts = np.maximum(fit.errors / (_TOLD * limits), away / limits) + none
+        is_blur = np.array([u.name == "blur" for u in unknowns])
+        doubts = np.maximum(fit.errors / (_TOLD * limits), away / limits)
+        doubts += is_blur & (away < 2 * fit.errors)
         worst = int(np.argmax(doubts))
-        unknown, error = unknowns[worst], fit.errors[worst]
-        found = f"{fit.values[active[worst]]:.4g} ± {error:.2g} {unknown.unit}".rstrip()
-        if doubts[worst] <= 1:
-            return worst, ""
-        if error > _TOLD * unknown.search:
-            return worst, f"the captures do not tell it: {found}"
-        return worst, f"{found} " + (
-            "is no more than none" if none[worst] else "is beyond the search"
-        )
+        value, error = fit.values[active[worst]], fit.errors[worst]
+        found = f"{value:.4g} ± {error:.2g} {unknowns[worst].unit}".rstrip()
+        why = "beyond the search" if away[worst] > limits[worst] else "not told by the captures"
+        return worst, f"{why}, {found}" if doubts[worst] > 1 else ""
 
     def _slopes(self, values, active, images) -> Float[np.ndarray, "unknown number"]:
         found = []
@@ -366,32 +339,26 @@ def _unknowns(
     model: Psfs | Cameras, names: tuple[str, ...], search: float
 ) -> tuple[list[_Unknown], dict[str, str]]:
     """The numbers to find, and those that cannot be."""
-    found, reasons = [], {}
-    known = {
-        "scale": _Unknown("scale", "", 1.0, search),
-        "turn": _Unknown("turn", "rad", 0.0, _TURN),
-        "blur": _Unknown("blur", "pixels²", 0.0, _BLUR),
-    }
     if isinstance(model, Cameras):
         furthest, focus = _distances(model)
-        known = {
-            "distance": _Unknown("distance", "mm", furthest, search * furthest),
-            "object_distance": _Unknown("object_distance", "mm", focus, search * focus),
-        }
-        if not math.isfinite(focus) and "object_distance" in names:
-            reasons["object_distance"] = "it is infinite"
-    for name in (n for n in names if n not in reasons):
-        if name == "shift":
-            found += [
-                _Unknown(f"shift_{axis} {number}", "pixels", 0.0, _SHIFT)
-                for number in range(2, model.count + 1)
-                for axis in "yx"
-            ]
-            if model.count == 1:
-                reasons[name] = "one capture cannot tell it: the scene shifts instead"
-        else:
-            found.append(known[name])
-    return found, reasons
+        possible = [
+            _Unknown("distance", "mm", furthest, search * furthest),
+            _Unknown("object_distance", "mm", focus, search * focus),
+        ]
+    else:
+        possible = [
+            _Unknown("scale", "", 1.0, search),
+            _Unknown("turn", "rad", 0.0, _TURN),
+            _Unknown("blur", "pixels²", 0.0, _BLUR),
+        ]
+        numbers = range(2, model.count + 1)
+        shifts = [f"shift_{axis} {number}" for number in numbers for axis in "yx"]
+        possible += [_Unknown(name, "pixels", 0.0, _SHIFT) for name in shifts]
+    wanted = [u for u in possible if u.name.startswith(names)]
+    reasons = {u.name: "it is infinite" for u in wanted if not math.isfinite(u.given)}
+    if "shift" in names and model.count == 1:
+        reasons["shift"] = "one capture cannot tell it: the scene shifts instead"
+    return [u for u in wanted if u.name not in reasons], reasons
 
 
 def _moved(model: Psfs | Cameras, values: dict[str, float]) -> Psfs | Cameras:
@@ -425,9 +392,8 @@ def changed_psf(
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> Float[np.ndarray, "*batch k l"]:
     """A PSF by a `Refinement`'s scale, turn and blur, then shifted by pixels, with its sum."""
-    scale, turn, blur = (
-        values.get(n, v) for n, v in (("scale", 1.0), ("turn", 0.0), ("blur", 0.0))
-    )
+    scale, turn = values.get("scale", 1.0), values.get("turn", 0.0)
+    blur = values.get("blur", 0.0)
     if (scale, turn, blur, *shift) == (1.0, 0.0, 0.0, 0.0, 0.0):
         return psf
     planes = psf.reshape(-1, *psf.shape[-2:]).astype(float)
