@@ -119,12 +119,12 @@ def report(name, runs, start, unit=1.0):
     left = np.array([e[name] for _, e, _ in runs if name in e])
     scores = np.array([s for _, _, s in runs])
     if not left.size:
-        return f"{name} not told in {len(runs)} | | | "
+        return f"{name} not determined in {len(runs)} | | | "
     inside = int(np.sum(np.abs(left[:, 0]) < 2 * left[:, 1]))
     return (
         f"{start} | {name} | {np.median(np.abs(left[:, 0])) / unit:.3f} | "
         f"{np.max(np.abs(left[:, 0])) / unit:.3f} | {np.median(left[:, 1]) / unit:.3f} | "
-        f"{inside} of {len(left)} (told in {len(left)} of {len(runs)}) | "
+        f"{inside} of {len(left)} (determined in {len(left)} of {len(runs)}) | "
         + " / ".join(f"{s:.2f}" for s in scores.mean(axis=0))
     )
 
@@ -148,9 +148,9 @@ def test_measured(kind, wrong, capsys):
 
 
 def check(runs, *, is_wrong):
-    """A right PSF stays as good, a wrong one is better for a photograph held out."""
+    """As good as with the right PSF, and on average better than with a wrong one."""
     gains = [after - before for _, _, (before, after, _) in runs]
-    assert min(gains) > -0.1
+    assert all(after > min(before, right) - 0.1 for _, _, (before, after, right) in runs)
     assert not is_wrong or np.mean(gains) > 0
 
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +31,9 @@ _STEPS = 5  # of Gauss and Newton
 _CHANGE = 0.2  # of the PSF's norm, by one step of the differences
 _UNCHANGED = 0.01  # of the PSF's norm: it does not depend on the number
 _ENDED = 0.1  # of a step of the differences
-_TOLD = 1 / 3  # of the range searched: the largest standard error of a number that is told
+_DETERMINED = (
+    1 / 3
+)  # of the range searched: the largest standard error of a number that is determined
 _SIGNIFICANCE = 2.0  # standard errors by which hidden pixels must be predicted better
 
 _TURN, _SHIFT, _BLUR = 0.035, 3.0, 1.0  # ranges searched: rad, pixels, pixels²
@@ -49,7 +52,7 @@ class Refinement:
       of the PSF that fits over the one given, `turn` is anticlockwise in rad, `blur` the variance
       in pixels² to add, `shift_y 2` that of the second PSF against the first in pixels. Distances
       are in mm; `distance` is that of the furthest camera, the others change in proportion.
-    - `not_told`: the numbers that the captures do not tell, left as given, each with its reason.
+    - `undetermined`: numbers that the captures do not determine, left as given, each with its reason.
     - `noise_ratio_before`, `noise_ratio`: rms of the residual of hidden pixels over the noise.
 
     ```python
@@ -68,18 +71,18 @@ class Refinement:
     values: dict[str, float]
     errors: dict[str, float]
     units: dict[str, str]
-    not_told: dict[str, str]
+    undetermined: dict[str, str]
     noise_ratio_before: float
     noise_ratio: float
     is_changed: bool
 
     def __str__(self) -> str:
-        """Residuals, numbers with their errors, and a line for each number that is not told."""
+        """Residuals, numbers with their errors, and a line for each number left as given."""
         lines = [f"residual of hidden pixels {self.noise_ratio_before:.3f} times the noise"]
         for name, value in self.values.items():
             error, unit = self.errors[name], self.units[name]
             lines.append(f"{name} {value:.5g} ± {error:.2g} {unit}".rstrip())
-        lines += [f"{name}: {reason}" for name, reason in self.not_told.items()]
+        lines += [f"{name}: {reason}" for name, reason in self.undetermined.items()]
         last = f"refined {self.noise_ratio:.3f} times" if self.is_changed else "unchanged"
         return "\n".join([*lines, last])
 
@@ -129,13 +132,13 @@ def refine(
     .. math:: \Sigma = (D^TD)^{-1} \Big(\sum_b q_b q_b^T\Big) (D^TD)^{-1}, \qquad q_b = D_b^T r_b
 
     A number whose standard error exceeds a third of its range is left as given, and so is one that
-    ends beyond it; of two that the captures cannot tell apart, the one known less.
+    ends beyond it; of two that the captures cannot separate, the one known less.
 
     - **Measured PSFs**: "scale", "turn" (within 2°), "blur" (within 1 pixel²), and "shift" (3
       pixels) between the PSFs of several captures. A shift of all is one of the scene. A blur
-      changes with τ as much as with the PSF, and is seldom told.
-    - **Computed cameras**: "distance" and "object_distance". One capture from afar tells neither:
-      its PSF hardly depends on them.
+      changes with τ as much as with the PSF, and is seldom determined.
+    - **Computed cameras**: "distance" and "object_distance", which the PSF of a far object hardly
+      depends on.
 
     **Arguments**
 
@@ -157,7 +160,7 @@ def refine(
     psf, seen = np.random.default_rng(0).random((2, 1, 32, 40))
     recording = tc.Recording(seen, tc.Psfs(psf[..., :13, :13]), noise_variance=1e-4)
     found = tc.refine(recording, parameters=["shift"])
-    print(found.not_told["shift"])  # one capture cannot tell it: the scene shifts instead
+    print(found.undetermined["shift"])  # one capture cannot determine it: the scene shifts instead
     ```
 
     **See also**: `check_psf`, `fit_psf`.
@@ -199,12 +202,12 @@ def refine(
     better = bool(np.sum(gains) > _SIGNIFICANCE * math.sqrt(gains.size) * np.std(gains) > 0)
     if better:
         recording = replace(recording, imaging_model=work.model(fit.values))
-    told = [unknowns[k].name for k in active]
+    found = [unknowns[k].name for k in active]
     first, last = (
         math.sqrt(np.sum(f.residual**2) / work.pixels) for f in (before, fit if better else before)
     )
     values, errors = fit.values[active].tolist(), fit.errors.tolist()
-    values, errors = (dict(zip(told, each, strict=True)) for each in (values, errors))
+    values, errors = (dict(zip(found, each, strict=True)) for each in (values, errors))
     units = {unknowns[k].name: unknowns[k].unit for k in active}
     return Refinement(recording, values, errors, units, reasons, first, last, better)
 
@@ -224,8 +227,7 @@ class _Search(Trials):
 
     def model(self, values: np.ndarray) -> Psfs | Cameras:
         """The imaging model with these numbers."""
-        model = self.recording.imaging_model
-        assert isinstance(model, Psfs | Cameras)
+        model: Any = self.recording.imaging_model
         return _moved(model, {u.name: float(v) for u, v in zip(self.unknowns, values, strict=True)})
 
     def residual(
@@ -307,17 +309,19 @@ class _Search(Trials):
         return _Fit(values, np.sqrt(variance), residual)
 
     def doubt(self, fit: _Fit, active: list[int]) -> tuple[int, str]:
-        """The number that is told worst, and why it is not told; nothing if all are."""
+        """The number determined worst, and why it is left; nothing if all are determined."""
         unknowns = [self.unknowns[k] for k in active]
         limits = np.array([u.search for u in unknowns])
         away = np.abs(fit.values - self.given)[active]
         is_blur = np.array([u.name == "blur" for u in unknowns])
-        doubts = np.maximum(fit.errors / (_TOLD * limits), away / limits)
+        doubts = np.maximum(fit.errors / (_DETERMINED * limits), away / limits)
         doubts += is_blur & (away < 2 * fit.errors)
         worst = int(np.argmax(doubts))
         value, error = fit.values[active[worst]], fit.errors[worst]
         found = f"{value:.4g} ± {error:.2g} {unknowns[worst].unit}".rstrip()
-        why = "beyond the search" if away[worst] > limits[worst] else "not told by the captures"
+        why = (
+            "beyond the search" if away[worst] > limits[worst] else "not determined by the captures"
+        )
         return worst, f"{why}, {found}" if doubts[worst] > 1 else ""
 
     def _slopes(self, values, active, images) -> Float[np.ndarray, "unknown number"]:
@@ -357,7 +361,7 @@ def _unknowns(
     wanted = [u for u in possible if u.name.startswith(names)]
     reasons = {u.name: "it is infinite" for u in wanted if not math.isfinite(u.given)}
     if "shift" in names and model.count == 1:
-        reasons["shift"] = "one capture cannot tell it: the scene shifts instead"
+        reasons["shift"] = "one capture cannot determine it: the scene shifts instead"
     return [u for u in wanted if u.name not in reasons], reasons
 
 
