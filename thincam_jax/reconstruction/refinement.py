@@ -52,7 +52,7 @@ class Refinement:
       of the PSF that fits over the one given, `turn` is anticlockwise in rad, `blur` the variance
       in pixels² to add, `shift_y 2` that of the second PSF against the first in pixels. Distances
       are in mm; `distance` is that of the furthest camera, the others change in proportion.
-    - `undetermined`: numbers that the captures do not determine, left as given, each with its reason.
+    - `undetermined`: numbers that the captures do not determine, left as given, with the reason.
     - `noise_ratio_before`, `noise_ratio`: rms of the residual of hidden pixels over the noise.
 
     ```python
