@@ -149,7 +149,7 @@ def test_changed_psfs_are_those_of_the_pattern():
 @pytest.mark.thorough
 def test_slopes_are_those_of_the_misfit_by_differences(capture):
     """Of the misfit of hidden pixels, with the image's response."""
-    psfs = tc.Psfs(spots(scale=0.99)[None])
+    psfs = tc.Psfs(spots(scale=0.99, turn=-0.01)[None])
     unknowns, _ = _unknowns(psfs, ("scale", "turn"), 0.06)
     search = _Search(tc.Recording(capture, psfs), 0.5, unknowns, None)
     search.residual(search.given, None, 400)

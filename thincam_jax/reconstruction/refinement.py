@@ -132,7 +132,8 @@ def refine(
     .. math:: \Sigma = (D^TD)^{-1} \Big(\sum_b q_b q_b^T\Big) (D^TD)^{-1}, \qquad q_b = D_b^T r_b
 
     A number whose standard error exceeds a third of its range is left as given, and so is one that
-    ends beyond it; of two that the captures cannot separate, the one known less.
+    ends beyond it; of two that the captures cannot separate, the one known less (the errors of
+    the other hold if it is right).
 
     - **Measured PSFs**: "scale", "turn" (within 2°), "blur" (within 1 pixel²), and "shift" (3
       pixels) between the PSFs of several captures. A shift of all is one of the scene. A blur
