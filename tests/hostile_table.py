@@ -214,6 +214,7 @@ OPTICS = (
     ),
     call(tc.choose_solver, recording=seen()),
     call(tc.check_psf, recording=seen(), search=0.06, tau=2.0),
+    call(tc.refine, recording=seen(), parameters=["turn"], search=0.06, tau=0.5),
     call(tc.separable_operator, camera=camera(MASKS[4]), scene=PLANE, tolerance=0.01),
     call(
         measured.prepare,

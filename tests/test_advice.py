@@ -100,6 +100,13 @@ CASES = {
             tc.Recording(RANDOM.random((1, 32, 40)), tc.Psfs(PSF[None])), search=0.02
         ),
     ),
+    "a refinement of operators": Case(
+        "give a recording with tc.Psfs",
+        lambda: tc.refine(tc.Recording(CAPTURE, FLATCAM)),
+        lambda: tc.refine(
+            tc.Recording(RANDOM.random((1, 32, 40)), tc.Psfs(PSF[None])), parameters=["turn"]
+        ),
+    ),
     "a response that the axis leaves out": Case(
         "give model=PsfMethod(field_tolerance=1.0)",
         lambda: tc.capture(bright(CAMERA), SCENE),

@@ -18,7 +18,7 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
 - accuracy: `select_model`, `predict_error`, `plan`, `PsfMethod`
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
   `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV`, `PlugAndPlay` or `Learned`; `Stream`
-- calibration: `fit_psf`, `check_psf`, `fit_separable`, `measured`
+- calibration: `fit_psf`, `check_psf`, `refine`, `fit_separable`, `measured`
 - experiments: `studies`, `design`, `learn`, `plot`, `explore`, `hardware`
 
 The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes a second to import,

@@ -75,6 +75,7 @@ from .reconstruction import PoissonTV as PoissonTV
 from .reconstruction import PsfCheck as PsfCheck
 from .reconstruction import Psfs as Psfs
 from .reconstruction import Recording as Recording
+from .reconstruction import Refinement as Refinement
 from .reconstruction import Ridge as Ridge
 from .reconstruction import Stream as Stream
 from .reconstruction import TotalVariation as TotalVariation
@@ -83,6 +84,7 @@ from .reconstruction import check_psf as check_psf
 from .reconstruction import choose_solver as choose_solver
 from .reconstruction import implicit_proximal_gradient as implicit_proximal_gradient
 from .reconstruction import reconstruct as reconstruct
+from .reconstruction import refine as refine
 from .reconstruction import solve_fixed_point as solve_fixed_point
 
 __version__: str

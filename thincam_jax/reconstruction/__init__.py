@@ -25,6 +25,8 @@ from thincam_jax.reconstruction.proximal_gradient import solve_fista as solve_fi
 from thincam_jax.reconstruction.psf_check import PsfCheck as PsfCheck
 from thincam_jax.reconstruction.psf_check import check_psf as check_psf
 from thincam_jax.reconstruction.recording import Recording as Recording
+from thincam_jax.reconstruction.refinement import Refinement as Refinement
+from thincam_jax.reconstruction.refinement import refine as refine
 from thincam_jax.reconstruction.regularisers import Cosines as Cosines
 from thincam_jax.reconstruction.regularisers import Sparsity as Sparsity
 from thincam_jax.reconstruction.regularisers import Wavelet as Wavelet

@@ -13,8 +13,9 @@ from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum
-from thincam_jax.reconstruction.imaging_model import Psfs
+from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import InverseProblem, forward, objective, residuals
@@ -184,7 +185,7 @@ def check_psf(
     if search > 0.5:
         raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
     given = np.asarray(recording.imaging_model.psfs)
-    try_psf = _Trial(recording, float(tau))
+    try_psf = _Scenes(recording, float(tau))
     pixel = 2 / max(shape)
     wide = math.ceil(search / pixel)
     steps = [k for k in range(-wide, wide + 1) if k]
@@ -245,8 +246,8 @@ def blocks_blur(psf: Float[np.ndarray, "*batch k l"], block: int) -> bool:
     return bool(np.var(block_mean(kept, 2)) < _KEPT * np.var(kept))
 
 
-class _Trial:
-    """Reconstructs with a PSF, with the weights and the unit of τ of the PSF given."""
+class Trials:
+    """Problems of other imaging models, with the weights and the unit of τ of the one given."""
 
     def __init__(self, recording: Recording, tau: float):
         self.recording, self.tau = recording, tau
@@ -256,6 +257,26 @@ class _Trial:
         self.pixels = sum(int(np.count_nonzero(np.broadcast_to(w, c.shape))) for w, c in pairs)
         self.block = max(4, max(recording.captures[0].shape[-2:]) // _BLOCKS)
 
+    def problem(self, model: Psfs | Cameras) -> InverseProblem:
+        """The problem of another imaging model."""
+        problem = replace(self.recording, imaging_model=model).problem(tau=self.tau)
+        return eqx.tree_at(
+            lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
+        )
+
+    def blocks(self, values: Numbers) -> Float[np.ndarray, "*batch block"]:
+        """Sums over blocks of pixels."""
+        values = np.asarray(values)
+        shape = values.shape[-2:]
+        rows, columns = (-(-n // self.block) * self.block for n in shape)
+        padded = np.zeros((*values.shape[:-2], rows, columns))
+        padded[..., : shape[0], : shape[1]] = values
+        return block_sum(padded, self.block).reshape(*values.shape[:-2], -1)
+
+
+class _Scenes(Trials):
+    """Reconstructs the scene with a PSF."""
+
     def __call__(self, psf: np.ndarray) -> _Tried:
         problem = self._problem(psf)
         outcome = iterate(
@@ -264,26 +285,16 @@ class _Trial:
             Schedule(_ITERATIONS, 1e-6, adapt_until=_ITERATIONS // 2),
         )
         found, misfits = _parts(problem, outcome.image)
-        return _Tried(float(found), self._blocks(misfits), outcome.image)
+        return _Tried(float(found), self.blocks(misfits), outcome.image)
 
     def slopes(self, image: Image, psfs: list[np.ndarray], step: float) -> np.ndarray:
         """∂J/∂s of each block, of three PSFs of which the outer ones differ by `step`."""
-        return self._blocks(_slopes([self._problem(psf) for psf in psfs], image) / step)
+        return self.blocks(_slopes([self._problem(psf) for psf in psfs], image) / step)
 
     def _problem(self, psf: np.ndarray) -> InverseProblem:
         model = self.recording.imaging_model
         assert isinstance(model, Psfs)
-        tried = replace(self.recording, imaging_model=replace(model, psfs=psf))
-        problem = tried.problem(tau=self.tau)
-        return eqx.tree_at(
-            lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
-        )
-
-    def _blocks(self, values) -> np.ndarray:
-        rows, columns = (-(-n // self.block) * self.block for n in values.shape)
-        padded = np.zeros((rows, columns))
-        padded[: values.shape[0], : values.shape[1]] = values
-        return block_sum(padded, self.block).ravel()
+        return self.problem(replace(model, psfs=psf))
 
 
 @eqx.filter_jit
@@ -330,15 +341,8 @@ def _scaled(psf: np.ndarray, scale: float) -> Float[np.ndarray, "capture channel
     """
     if scale == 1:
         return psf
-    middle = (np.array(psf.shape[-2:]) - 1) / 2
     planes = psf.reshape(-1, *psf.shape[-2:])
-    start = middle - middle / scale
-    changed = np.stack(
-        [
-            scipy.ndimage.affine_transform(p, np.full(2, 1 / scale), start, mode="nearest")
-            for p in planes
-        ]
-    )
+    changed = resampled(planes, np.eye(2) / scale)
     wanted, found = (np.fft.rfft2(images) for images in (planes, changed))
     frequency = np.hypot(
         *np.meshgrid(np.fft.fftfreq(psf.shape[-2]), np.fft.rfftfreq(psf.shape[-1]), indexing="ij")
@@ -346,6 +350,17 @@ def _scaled(psf: np.ndarray, scale: float) -> Float[np.ndarray, "capture channel
     for before, after in zip(wanted, found, strict=True):
         after *= _sharpness(before, after, frequency)
     return np.fft.irfft2(found, psf.shape[-2:]).reshape(psf.shape).astype(psf.dtype)
+
+
+def resampled(
+    planes: Float[np.ndarray, "plane k l"], matrix: np.ndarray, shift: np.ndarray | float = 0.0
+) -> Float[np.ndarray, "plane k l"]:
+    """h(M r) about the centre, then shifted by (y, x) pixels, by cubic splines."""
+    middle = (np.array(planes.shape[-2:]) - 1) / 2
+    start = middle - matrix @ (middle + shift)
+    return np.stack(
+        [scipy.ndimage.affine_transform(p, matrix, start, mode="nearest") for p in planes]
+    )
 
 
 def _sharpness(wanted: np.ndarray, found: np.ndarray, frequency: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import get_type_hints
 import numpy as np
 import PIL.Image
 import pytest
+import scipy.ndimage
 import skimage.transform
 import tifffile
 from commands.reconstruct import simulated
@@ -435,6 +436,30 @@ def test_check_names_a_turned_psf(grey, tmp_path):
     wrong = check(grey, psf="turned")
     assert wrong.exit_code == 1
     assert "your PSF is wrong: it fits better turned by 180°" in wrong.stdout
+
+
+@pytest.mark.thorough
+def test_a_refined_psf_is_written_and_can_be_used(grey, tmp_path):
+    """One that was measured 3 % too small."""
+    small = tmp_path / "small.tif"
+    light = tifffile.imread(grey["psf"]).astype(float)
+    middle = (np.array(light.shape) - 1) / 2
+    start = middle - middle / 0.97
+    shrunk = scipy.ndimage.affine_transform(light, [1 / 0.97] * 2, start, mode="nearest")
+    tifffile.imwrite(small, np.round(shrunk).clip(0, 4095).astype(np.uint16))
+    grey["small"], out = small, tmp_path / "refined.tif"
+    bits = ("--bits", 12, "--downsample", 1)
+    result = check(grey, *bits, "--refine", out, psf="small")
+    assert result.exit_code == 0, result.output
+    assert f"written: --psf {out} --psf-background 0" in result.stdout
+    grey["refined"] = out
+    followed = check(grey, *bits, "--psf-background", 0, psf="refined")
+    assert followed.exit_code == 0 and "your PSF fits" in followed.stdout, followed.output
+
+
+def test_a_refined_psf_needs_a_linear_file(grey, tmp_path):
+    line = one_line(check(grey, "--refine", tmp_path / "refined.png"))
+    assert line.endswith("refined.png: give a file .npy or .tif")
 
 
 def test_psf_has_its_own_bits_corner_and_pixels(grey, tmp_path):

@@ -188,11 +188,15 @@ def check(
     dead: Dead = None,
     psf_channels: PsfChannels = "each",
     search: Annotated[float, Option(help="How far to look for the scale, parts of one.")] = 0.06,
+    refine: Annotated[
+        Path | None,
+        Option(help="Write the PSF of the scale, turn and blur that fit best (.npy, .tif)."),
+    ] = None,
 ) -> None:
-    """Tell whether a PSF is that of a capture.
+    """Tell whether a PSF is that of a capture, and refine it.
 
     Tries other scales, turns and mirror images of it. The exit code is 1 if one of them fits
-    better.
+    better, unless --refine has written it.
     """
     with reported(lambda: "interrupted; nothing is known of the PSF"):
         from thincam_jax.commands.reconstruct import options
@@ -221,7 +225,11 @@ def check(
         with progress_bar() as bar:
             task = bar.add_task("PSFs", total=None)
             lines, fits = check_files(
-                sources, capture, search, lambda n, of: bar.update(task, completed=n, total=of)
+                sources,
+                capture,
+                search,
+                lambda n, of: bar.update(task, completed=n, total=of),
+                refine,
             )
     say_result("findings", lines, "\n".join(lines))
     if not fits:

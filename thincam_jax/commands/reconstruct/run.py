@@ -20,10 +20,11 @@ from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
 from thincam_jax.measured.options import by_files
-from thincam_jax.measured.write import linear_bytes
-from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver
+from thincam_jax.measured.write import LINEAR, linear_bytes
+from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver, refine
 from thincam_jax.reconstruction.depth import depth_of_colours
 from thincam_jax.reconstruction.psf_check import blocks_blur
+from thincam_jax.reconstruction.refinement import changed_psf
 from thincam_jax.studies.prepared import (
     PixelNoise,
     PreparedResult,
@@ -35,6 +36,7 @@ from thincam_jax.studies.prepared import (
 
 _SIDE = 160  # pixels of the longer side, about: enough for half a per cent of scale
 _UNEXPLAINED = 0.9  # of the capture's norm
+_BRIGHTEST = 0.8  # of full scale, of a PSF that is written: it has not saturated
 
 Report = Callable[[str, Progress], None]
 
@@ -319,18 +321,40 @@ def _check_channels(job: Job, ready: measured.Prepared, recipe: Recipe, output: 
 
 
 def check_files(
-    sources: Sources, capture: Path, search: float, report: Callable[[int, int], object]
+    sources: Sources,
+    capture: Path,
+    search: float,
+    report: Callable[[int, int | None], object],
+    out: Path | None = None,
 ) -> tuple[list[str], bool]:
-    """The lines that report `check_psf` of two files, and whether the PSF fits."""
+    """The lines that report `check_psf` of two files, and whether the PSF fits.
+
+    - `out`: where the refined PSF is written, on the pixels of the files.
+    """
+    if out is not None and out.suffix.lower() not in LINEAR:
+        raise measured.MeasurementError(f"--refine {out}: give a file .npy or .tif")
     rig = Rig(sources)
     ready = rig.prepare(capture)
-    shape = ready.capture.shape[-2:]
+    shape, block = ready.capture.shape[-2:], sources.preparation.downsample
+    recording = prepared_recording(ready)
     try:
-        found = check_psf(prepared_recording(ready), search=search, callback=report)
+        found = check_psf(recording, search=search, callback=report)
     except ValueError as error:
         raise measured.MeasurementError(str(error)) from None
-    size = f"{shape[0]}×{shape[1]} pixels, blocks of {sources.preparation.downsample}"
-    return [f"{sources.psf} with {capture} at {size}:", str(found)], found.fits
+    size = f"{shape[0]}×{shape[1]} pixels, blocks of {block}"
+    lines = [f"{sources.psf} with {capture} at {size}:", str(found)]
+    if out is None:
+        return lines, found.fits
+    if found.orientation != "as given":
+        return [*lines, "nothing refined: correct the PSF's orientation first"], False
+    better = refine(recording, search=search, callback=lambda done: report(done, None))
+    if not better.is_changed:
+        return [*lines, str(better), "nothing written"], found.fits
+    whole = replace(sources, preparation=replace(sources.preparation, downsample=1))
+    changes = better.values | {"blur": better.values.get("blur", 0.0) * block**2}
+    psf = changed_psf(Rig(whole).prepare(capture).psf, changes)
+    measured.write_image(out, _BRIGHTEST * psf / psf.max())
+    return [*lines, str(better), f"written: --psf {out} --psf-background 0"], True
 
 
 def enough_blocks(sources: Sources, capture: Path) -> Sources:
