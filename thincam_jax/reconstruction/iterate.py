@@ -55,13 +55,17 @@ class Progress:
 
 
 class Outcome(eqx.Module):
-    """The image with the lowest objective among those checked, and the history of the run."""
+    """The image with the lowest objective among those checked, and the history of the run.
+
+    - `reason`: what the user should know of the result; "" for nothing.
+    """
 
     image: Image
     status: Status
     history: tuple[Progress, ...]
     iterations: int
     seconds: float
+    reason: str = ""
 
 
 class AbstractMethod(eqx.Module, Generic[Method_State]):
@@ -161,9 +165,11 @@ class Schedule:
     """When a run is checked, adapted and ended.
 
     - `iterations`: at most, counted from `done`, those of an earlier run.
-    - `tolerance`: both residuals must fall below it.
+    - `tolerance`: both residuals must fall below it, see also `settled`.
     - `check_every`: iterations between two checks.
     - `adapt_until`: last iteration after which the method may adapt.
+    - `settled`: a run has also converged if the objective changed by less than this share of it
+      over the last two intervals between checks.
     """
 
     iterations: int
@@ -171,6 +177,7 @@ class Schedule:
     check_every: int = CHUNK
     adapt_until: int = 0
     done: int = 0
+    settled: float = 0.0
 
 
 def iterate(
@@ -212,7 +219,8 @@ def iterate(
             if falling:
                 best = current
             history.append(progress)
-            if max(progress.primal, progress.dual) < schedule.tolerance:
+            small = max(progress.primal, progress.dual) < schedule.tolerance
+            if small or _settled(history, schedule.settled):
                 status = "converged"
                 break
             if callback is not None and callback(progress):
@@ -223,6 +231,12 @@ def iterate(
     except KeyboardInterrupt:
         status = "interrupted"
     return Outcome(best, status, tuple(history), done, time.perf_counter() - began)
+
+
+def _settled(history: Sequence[Progress], share: float) -> bool:
+    """Whether the objective hardly changed over the last two intervals between checks."""
+    last = [p.objective for p in history[-3:]]
+    return len(history) > 3 and max(last) - min(last) < share * last[-1]
 
 
 @eqx.filter_jit

@@ -21,6 +21,7 @@ equation, (μ₁ + μ₂ΨᵀΨ + μ₃)⁻¹. The proximal map of the data is t
 which `normal_equations` finds by the structure of the operators.
 """
 
+import functools
 from typing import ClassVar
 
 import equinox as eqx
@@ -62,13 +63,18 @@ from thincam_jax.reconstruction.total_variation import (
 )
 
 
-def admm_method(problem: InverseProblem, relaxation: Number = RELAXATION) -> AdmmMethod:
-    """ADMM for a problem, with the splitting that suits its operators."""
-    return AdmmMethod(problem, splitting_of(problem), relaxation)
+def admm_method(
+    problem: InverseProblem, relaxation: Number = RELAXATION, *, near: bool = False
+) -> AdmmMethod:
+    """ADMM for a problem, with the splitting that suits its operators; see `splitting_of`."""
+    return AdmmMethod(problem, splitting_of(problem, near=near), relaxation)
 
 
-def splitting_of(problem: InverseProblem) -> AbstractSplitting:
-    """The splitting that suits the operators of a problem."""
+def splitting_of(problem: InverseProblem, *, near: bool = False) -> AbstractSplitting:
+    """The splitting that suits the operators of a problem.
+
+    - `near`: whether the start image has the right low frequencies.
+    """
     variation = problem.regulariser
     if not isinstance(variation, TotalVariation):
         raise ValueError(
@@ -78,7 +84,7 @@ def splitting_of(problem: InverseProblem) -> AbstractSplitting:
     operators = convolutions(problem)
     if operators is None:
         return DirectSplitting(problem, variation)
-    return FourierSplitting(problem, operators, variation)
+    return FourierSplitting(problem, operators, variation, near=near)
 
 
 class FourierSplitting(AbstractSplitting):
@@ -99,6 +105,8 @@ class FourierSplitting(AbstractSplitting):
         problem: InverseProblem,
         operators: tuple[CropConvolution, ...],
         variation: TotalVariation,
+        *,
+        near: bool = False,
     ):
         units = _units(problem, operators, variation)
         # The operators themselves: a compiled function would return copies.
@@ -106,7 +114,7 @@ class FourierSplitting(AbstractSplitting):
         self.gains, self.captures, self.weights, self.tau, self.normal, self.image_unit = units
         self.variation, self.nonnegative = variation, problem.nonnegative
         self.background = problem.background
-        self.penalties = _default_penalties(self.operators, self.gains)
+        self.penalties = _default_penalties(self.operators, self.gains, near)
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
         scaled = tuple(g / self.image_unit * c for g, c in zip(self.gains, captures, strict=True))
@@ -188,15 +196,15 @@ def _units(problem: InverseProblem, operators, variation: TotalVariation):
     return gains, captures, weights, tau, normal, capture_unit / operator_unit
 
 
-@jax.jit
-def _default_penalties(operators, gains) -> Penalties:
-    r"""Penalties that suit the operators' spectrum.
+@functools.partial(jax.jit, static_argnames="near")
+def _default_penalties(operators, gains, near: bool) -> Penalties:
+    r"""Penalties that suit the operators' spectrum, by rules of thumb.
 
     If one low frequency is far stronger than the others, as with a bright background, the splits
-    of variation and image weigh more by the ratio of the largest to the root mean square,
-    μ₂ = μ₃ = max|H|/rms|H|. μ₁ = 1 weighs the split data like the data. A rule of thumb, which
-    residual balancing corrects. Several planes are separated by frequencies in which their PSFs
-    differ, a tenth as strong or less: μ₁ = 0.1, and μ₂ = μ₃ a hundredth of the above.
+    of variation and image weigh more by the ratio r = max|H|/rms|H|, μ₂ = μ₃ = r. μ₁ = 1 weighs the
+    split data like the data. From an image with the right low frequencies 3√r and √r are faster.
+    Residual balancing corrects them. Several planes are separated by frequencies in which their
+    PSFs differ, a tenth as strong or less: μ₁ = 0.1, μ₂ = μ₃ = r/100.
     """
     power = sum(
         g**2 * jnp.sum(squared_modulus(o.spectrum), axis=-3)
@@ -205,7 +213,9 @@ def _default_penalties(operators, gains) -> Penalties:
     strongest = jax.lax.stop_gradient(or_one(jnp.sqrt(jnp.max(power))))
     if operators[0].spectrum.shape[-3] > 1:
         return Penalties(jnp.full_like(strongest, 0.1), strongest / 100, strongest / 100)
-    return Penalties(jnp.ones_like(strongest), strongest, strongest)
+    root = jnp.sqrt(strongest)
+    variation, image = (3 * root, root) if near else (strongest, strongest)
+    return Penalties(jnp.ones_like(strongest), variation, image)
 
 
 def _operator_unit(operators, weights) -> Float[Array, ""]:

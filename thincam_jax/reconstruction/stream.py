@@ -95,7 +95,8 @@ class Stream(AnyRank):
                 "the same camera, or start another stream"
             )
         given = tuple(jnp.asarray(c) for c in given)
-        replace(self.recording, captures=given).require_finite()
+        # Of the same valid pixels: a new recording would leave out what is NaN now.
+        eqx.tree_at(lambda r: r.captures, self.recording, given).require_finite()
         state, image = _next(self, given)
         return eqx.tree_at(lambda s: s.state, self, state), image
 

@@ -125,7 +125,7 @@ def _high_passed(problem: InverseProblem, rows: tuple[bool, ...], removed, lengt
     """High-pass the spectra and captures of the given rows."""
     operators, captures = list(convolutions(problem) or ()), list(problem.captures)
     window = operators[0].window
-    low = jnp.asarray(_window_transfer(length, window), problem.captures[0].dtype)
+    low = jnp.asarray(window_transfer(length, window), problem.captures[0].dtype)
 
     def filtered(capture, corner, transfer):
         spectrum = jnp.fft.rfft2(place(capture, corner, window))
@@ -143,7 +143,7 @@ def _high_passed(problem: InverseProblem, rows: tuple[bool, ...], removed, lengt
     )
 
 
-def _window_transfer(length: int, window: tuple[int, int]) -> np.ndarray:
+def window_transfer(length: int, window: tuple[int, int]) -> np.ndarray:
     """Transfer function of a Hann window of sum 1 in both directions, centred: real."""
     hann = np.hanning(length + 2)[1:-1]
     places = np.arange(length) - length // 2

@@ -203,6 +203,6 @@ class TestPlan:
 
 
 def test_iterations_are_those_given_or_the_methods_own():
-    for method, own in (("admm_tv", 100), ("pnp", 5)):
+    for method, own in (("admm_tv", 300), ("pnp", 5)):
         assert Recipe(method=method).solver(1).iterations == own
         assert Recipe(method=method, iterations=3).solver(1).iterations == 3
