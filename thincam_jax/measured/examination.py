@@ -1,6 +1,7 @@
 """Examination of captures and a PSF as they came in: values in them that measure no light."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,37 +25,23 @@ _OUTER = np.flatnonzero(np.pad(np.zeros((3, 3)), 1, constant_values=1))  # of 5�
 # Unit and consequence, and what mends it.
 _TEXTS = {
     "plateau": "% of the pixels have the largest value, {}, and are not used; give {} to say so",
-    "flat": "% of the pixels have the largest value, {}: the PSF is cut off there; expose it less, "
-    "or merge exposures",
+    "flat": "% of the pixels have the largest value, {}, where the light is cut off; expose less",
     "defective": "hot or dead pixels are not used; give a map of them with --dead",
-    "replaced": "hot or dead pixels are replaced by the median of their neighbours; subtract a "
-    "dark frame with --psf-background",
-    "mosaic": "% is the difference of the pixels of 2×2, as of a colour sensor: a grid is seen; "
-    "give --bayer {}, by the camera's manual",
-    "no mosaic": "% is the difference of the pixels of 2×2, not as of a colour sensor; leave "
-    "--bayer out",
+    "replaced": "hot or dead pixels are filled by their neighbours; subtract a dark frame",
+    "mosaic": "% is the step between pixels, as of a colour sensor, which shows; give --bayer {}",
+    "no mosaic": "% is the step between pixels, not as of a colour sensor; leave --bayer out",
     "overexposed": "% of the pixels are saturated: the image is a guess there; expose less",
-    "underexposed": "% of full scale is the brightest part: noise and steps of counts show; expose "
-    "longer, or give the --bits of the camera",
-    "cut": "% of its peak is the change of light along its border: what is beyond is missing; make "
-    "it smaller, or compute it with --camera",
-    "swapped": "% of the capture is not explained by the PSF, which it explains to {} %; they seem "
-    "swapped: exchange --psf and --capture",
-    "unexplained": "% of the capture's variation is neither image nor noise; see whether the PSF "
-    "is of this capture, by thincam calibrate check",
-    "noise": "counts of noise are found, and {} are given; leave --noise out, unless the light has "
-    "detail as fine as a pixel",
+    "underexposed": "% of full scale is the brightest part; expose longer, or give its --bits",
+    "cut": "% of its peak varies along its border: what is beyond is missing; compute it: --camera",
+    "swapped": "% is not explained by the PSF, which it explains; exchange --psf and --capture",
+    "unexplained": "% of its variation is neither image nor noise; try thincam calibrate check",
+    "noise": "counts of noise are found, and {} are given; leave --noise out if that is unsure",
 }
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of a capture or PSF.
-
-    - `name`: kind, as "plateau". `where`: which image. `number`: its size, of the unit with which
-      `consequence`, the effect on the image, begins.
-    - `advice`: what mends it, in the spelling of the shell. `severe`: the image will be wrong.
-    """
+    """One fault of an image: its `number`, whose unit begins `consequence`, and what mends it."""
 
     name: str
     where: str
@@ -64,7 +51,6 @@ class Finding:
     severe: bool = False
 
     def __str__(self) -> str:
-        """One line."""
         return f"{self.where}: {self.number:.3g} {self.consequence}; {self.advice}"
 
 
@@ -76,11 +62,7 @@ def finding(name: str, where: str, number: float, severe: bool = False, *words: 
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """Findings, and the images with what could be mended without asking.
-
-    - `captures`: with their plateaus as saturation and their defective pixels as dead ones.
-    - `psf`: with the median of their neighbours in place of defective pixels.
-    """
+    """Findings, and the images: plateaus are saturation, defective pixels dead, or filled."""
 
     findings: tuple[Finding, ...]
     captures: tuple[Raw, ...]
@@ -93,40 +75,36 @@ def examine(
 ) -> Examination:
     """Examine raw captures of one camera and their PSF for faults that decide the image.
 
-    - `options`: of the preparation that follows: the Bayer pattern and the saturation.
-
-    Each test is a robust statistic with a threshold beyond the noise of clean images:
+    `options` of the preparation that follows: the Bayer pattern and the saturation.
 
     - plateau: many pixels share the largest value, and few each of the next lower ones.
-    - defective: single pixels beyond all eight neighbours (of their Bayer colour) by a multiple of
-      the neighbours' range, without the blur that light has; of several captures, at one place in
-      more than half of them. Images with structure as fine as a pixel are left alone.
+    - defective: single pixels beyond all neighbours of their colour by a multiple of their range,
+      without the blur of light, in most of the captures, in images without structure as fine.
     - mosaic: the means of the pixels of 2×2 differ, but not those of one diagonal, green.
-    - wrong exposures, and a PSF whose light varies along the sensor's edge.
+    - exposure, and a PSF whose light varies along its border; a computed one is not examined.
     - swapped: the capture as PSF explains the PSF as capture, and not the reverse.
-
-    A PSF that was computed (`sensor_shape`) is not examined.
     """
     options = options or Preparation()
-    seen, findings = [], []
-    odd = [defective_pixels(raw, _mosaic(raw, options)) for raw in captures]
-    for raw, own in zip(captures, odd, strict=True):
-        raw, found = _examined(raw, f"capture {raw.name}", options)
-        same = [one for one in odd if one.shape == own.shape]
-        own = own & (2 * np.sum(same, axis=0) > len(same))
-        if own.any():
-            found.append(finding("defective", f"capture {raw.name}", own.sum()))
-            raw = replace(raw, dead=own if raw.dead is None else own | raw.dead)
-        findings += found
-        seen.append(raw)
-    if psf is not None and psf.sensor_shape is None:
-        psf, found = _examined(psf, f"PSF {psf.name}", options)
-        odd = defective_pixels(psf, _mosaic(psf, options))
-        if odd.any():
-            found.append(finding("replaced", f"PSF {psf.name}", odd.sum()))
-            psf = _filled(psf, odd, _mosaic(psf, options))
-        findings += [*found, *_cut(psf), *(one for raw in seen[:1] for one in _swapped(psf, raw))]
-    return Examination(tuple(findings), tuple(seen), psf)
+    is_measured = psf is not None and psf.sensor_shape is None
+    images, count = [*captures, psf] if is_measured else [*captures], len(captures)
+    findings: list[Finding] = []
+    maps = [defective_pixels(raw, _mosaic(raw, options)) for raw in images]
+    for n, odd in enumerate(maps):
+        is_psf, raw = n == count, images[n]
+        where = f"{'PSF' if is_psf else 'capture'} {raw.name}"
+        images[n] = raw = _examined(raw, where, options, findings)
+        same = [one for one in maps[:count] if one.shape == odd.shape]
+        if is_psf and odd.any():
+            findings.append(finding("replaced", where, float(odd.sum())))
+            images[n] = _filled(raw, odd, _mosaic(raw, options))
+        elif not is_psf and (odd := odd & (2 * np.sum(same, axis=0) > len(same))).any():
+            findings.append(finding("defective", where, float(odd.sum())))
+            images[n] = replace(raw, dead=odd if raw.dead is None else odd | raw.dead)
+    if is_measured and captures and images[0].pixels.shape[:2] == images[-1].pixels.shape[:2]:
+        left, other = _unexplained(images[-1], images[0]), _unexplained(images[0], images[-1])
+        if 0 < other < left / 2:
+            findings.append(finding("swapped", f"capture {images[0].name}", 100 * left, True))
+    return Examination(tuple(findings), tuple(images[:count]), images[-1] if is_measured else psf)
 
 
 def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
@@ -143,29 +121,26 @@ def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
 def defective_pixels(raw: Raw, is_mosaic: bool = False) -> Bool[np.ndarray, "y x"]:
     """Map of single pixels that differ from all neighbours of their colour as no light does."""
     found = np.zeros(raw.pixels.shape[:2], bool)
-    dead = found.copy() if raw.dead is None else raw.dead
-    step = 1.0 if raw.pixels.dtype.kind == "u" else 0.0
     for part in _phases(is_mosaic):
         planes = np.atleast_3d(raw.pixels[part]).astype(np.float32)
         for plane in np.moveaxis(planes, -1, 0):
-            found[part] |= _defective(plane, step, dead[part])
-    return found
+            found[part] |= _defective(plane, float(raw.pixels.dtype.kind == "u"))
+    return found if raw.dead is None else found & ~raw.dead
 
 
-def _defective(plane: np.ndarray, step: float, dead: np.ndarray) -> np.ndarray:
+def _defective(plane: np.ndarray, step: float) -> np.ndarray:
     """`defective_pixels` of one colour; `step`: of its values."""
-    none = np.zeros(plane.shape, bool)
     if min(plane.shape) < 8:
-        return none
+        return np.zeros(plane.shape, bool)
     high = scipy.ndimage.maximum_filter(plane, footprint=_RING, mode="mirror")
     low = scipy.ndimage.minimum_filter(plane, footprint=_RING, mode="mirror")
     beyond = np.maximum(plane - high, low - plane)
     middle, top = np.percentile(plane, [50, 99.5])
     floor = max(_CERTAIN * max(_noise(plane), step), 0.01 * (top - middle))
-    odd = (beyond > np.maximum(_ISOLATED * (high - low), floor)) & ~dead
+    odd = beyond > np.maximum(_ISOLATED * (high - low), floor)
     rows, columns = np.nonzero(odd)
     if not 0 < rows.size <= max(_FEW, odd.size // 100):
-        return none
+        return np.zeros_like(odd)
     # Light of a point reaches the neighbours; a defect does not raise them above what is around.
     padded = np.pad(plane, 2, mode="reflect")
     squares = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))[rows, columns]
@@ -177,10 +152,10 @@ def _defective(plane: np.ndarray, step: float, dead: np.ndarray) -> np.ndarray:
     around = scipy.ndimage.binary_dilation(odd, np.ones((5, 5), bool))
     base = scipy.ndimage.minimum_filter(plane, 5, mode="mirror")
     mean = (9 * scipy.ndimage.uniform_filter(plane, 3, mode="mirror") - plane) / 8
-    sharp = (plane - base > 2 * floor) & (mean - base < 0.25 * (plane - base)) & ~around
+    sharp = (plane - base > floor) & (mean - base < 0.25 * (plane - base)) & ~around
     light = np.maximum(np.abs(plane - middle) - floor / 2, 0)
     is_structure = 2 * sharp.sum() > odd.sum() or light[odd].sum() > 0.3 * light.sum()
-    return none if is_structure else odd
+    return odd & ~is_structure
 
 
 def _noise(plane: np.ndarray) -> float:
@@ -211,21 +186,19 @@ def _grey(raw: Raw) -> Float[np.ndarray, "y x"]:
     return np.atleast_3d(raw.pixels).mean(axis=2, dtype=np.float32)
 
 
-def _examined(raw: Raw, where: str, options: Preparation) -> tuple[Raw, list[Finding]]:
-    """An image with its plateau as saturation, and what histogram and colours say."""
-    found, is_psf = [], where.startswith("PSF")
+def _examined(raw: Raw, where: str, options: Preparation, found: list[Finding]) -> Raw:
+    """An image with its plateau as saturation; what histogram and colours say is added."""
+    is_psf, image, is_mosaic = where.startswith("PSF"), _grey(raw), _mosaic(raw, options)
     full, top, count = raw.full_scale, float(raw.pixels.max()), plateau(raw.pixels)
-    level = full * (options.saturation or 1.0)
-    if count and options.saturation is None and (raw.bits is None or top < full):
-        share, bits = 100 * count / raw.pixels.size, np.log2(top + 1)
-        give = (
-            f"--bits {bits:g}" if bits >= 8 and bits % 1 == 0 else f"--saturation {top / full:.5f}"
-        )
-        name, words = ("flat", (f"{top:g}",)) if is_psf else ("plateau", (f"{top:g}", give))
-        found.append(finding(name, where, share, is_psf and share > 1, *words))
+    level = full * (options.saturation or (1.0 if raw.bits else np.inf))
+    if count and options.saturation is None and top < level:
+        bits = max(8, math.ceil(np.log2(top + 1)))  # of a camera
+        given, most = ("", full) if 2**bits - 1 != top <= full else (f"--bits {bits}", 2**bits - 1)
+        given += f" --saturation {0.99999 * top / most:.6f}" * (top < most or not given)
+        share, words = 100 * count / raw.pixels.size, (f"{top:g}", given.strip())
+        kind, severe = ("flat", share > 1) if is_psf else ("plateau", False)
+        found.append(finding(kind, where, share, severe, *words))
         level, raw = top, replace(raw, saturation=top)
-    elif raw.bits is None and options.saturation is None:
-        level = np.inf
     share = 100 * float(np.mean(raw.pixels >= level))
     if not is_psf and share > _SATURATED:
         found.append(finding("overexposed", where, share, share > 50))
@@ -233,12 +206,14 @@ def _examined(raw: Raw, where: str, options: Preparation) -> tuple[Raw, list[Fin
     bright = 100 * (high - (low if raw.black_level is None else raw.black_level)) / full
     if raw.bits is not None and bright < _DIM:
         found.append(finding("underexposed", where, bright))
-    difference, error, pattern = _phase_difference(_grey(raw))
-    if raw.channels == 1 and not _mosaic(raw, options) and pattern:
+    difference, error, pattern = _phase_difference(image)
+    if raw.channels == 1 and pattern and not is_mosaic:
         found.append(finding("mosaic", where, difference, True, pattern))
-    elif not is_psf and _mosaic(raw, options) and difference + 6 * error < _COLOURED / 3:
+    elif not is_psf and is_mosaic and difference + 3 * error < _COLOURED:
         found.append(finding("no mosaic", where, difference))
-    return raw, found
+    if is_psf and (change := _border(image)) > _BORDER:
+        found.append(finding("cut", where, change))
+    return raw
 
 
 def _phase_difference(image: np.ndarray) -> tuple[float, float, str]:
@@ -262,32 +237,17 @@ def _phase_difference(image: np.ndarray) -> tuple[float, float, str]:
     return float(np.ptp(means)), float(error.max()), patterns if clear else ""
 
 
-def _cut(psf: Raw) -> Iterator[Finding]:
-    """Whether the PSF's light varies along its border, as a uniform background does not."""
-    image = _grey(psf)
-    if min(image.shape) < 32:
-        return
-    size = max(4, min(image.shape) // 16)
-    blurred = scipy.ndimage.uniform_filter1d
+def _border(image: np.ndarray) -> float:
+    """Change of light along the border beyond noise, % of the peak; 0 of a uniform background."""
+    size, blurred = max(4, min(image.shape) // 16), scipy.ndimage.uniform_filter1d
     strips = [blurred(image[[0, -1]], size, axis=1), blurred(image[:, [0, -1]], size, axis=0)]
     first, last = np.percentile(np.concatenate([one.ravel() for one in strips]), [10, 90])
     low, high = np.percentile(image, [5, 99.9])
-    share = 100 * (last - first - 6 * _noise(image) / size**0.5) / max(high - low, 1e-30)
-    if share > _BORDER:
-        yield finding("cut", f"PSF {psf.name}", share)
-
-
-def _swapped(psf: Raw, capture: Raw) -> Iterator[Finding]:
-    """Whether the capture explains the PSF, which is sharper, and not the reverse."""
-    if psf.pixels.shape[:2] == capture.pixels.shape[:2]:
-        left, other = (_unexplained(*pair) for pair in ((psf, capture), (capture, psf)))
-        if other < left / 2:
-            words = f"{100 * (1 - other):.3g}"
-            yield finding("swapped", f"capture {capture.name}", 100 * left, True, words)
+    return 100 * (last - first - 6 * _noise(image) / size**0.5) / max(high - low, 1e-30)
 
 
 def _unexplained(psf: Raw, capture: Raw) -> float:
-    """Part of a coarse capture's norm that a regularised inverse by the PSF leaves."""
+    """Part of a coarse capture's norm that a regularised inverse leaves."""
     spectra = []
     for image in (_grey(psf), _grey(capture)):
         size = max(1, min(image.shape) // _COARSE)

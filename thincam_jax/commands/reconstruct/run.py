@@ -131,7 +131,6 @@ class Rig:
         self.told: set[str] = set()
 
     def examine(self, capture: Path, focus: int = 0) -> Examination:
-        """Read a capture and examine it with its PSF."""
         image = measured.read_image(capture, self.sources.bits)
         return examine([image], self.psfs[focus], self.sources.preparation)
 
@@ -139,7 +138,6 @@ class Rig:
         return self.ready(self.examine(capture, focus))
 
     def ready(self, examined: Examination) -> measured.Prepared:
-        """Prepare what was examined."""
         psf, (image,) = examined.psf, examined.captures
         assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}
@@ -171,7 +169,7 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
     else:
         made = _focus(job, ready, recipe.focusing, noise)
     findings = (*examined.findings, *made.findings)
-    rig.tell(findings, recipe.strict)
+    rig.tell(() if made.doubt and not recipe.strict else findings, recipe.strict)
     image = made.image[:, ::-1, ::-1] if recipe.flip else made.image
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
     record = {
@@ -269,22 +267,21 @@ def _reconstruct(
         f"({noise.found.split()[0]})"
     )
     image, facts = done.image(recipe.field), _facts(done, recipe)
-    findings = () if doubt else tuple(_doubts(job, ready, done))
-    ending = found.status, found.iterations
-    return Finished(job, facts, image, line, doubt, *ending, findings=findings)
+    findings = () if found.status == "interrupted" else tuple(_doubts(job, ready, done))
+    ending = found.status, found.iterations, b"", findings
+    return Finished(job, facts, image, line, doubt, *ending)
 
 
 def _doubts(job: Job, ready: measured.Prepared, done: PreparedResult) -> Iterator[Finding]:
     """A residual far above the noise, and a given noise that is not the one found."""
-    where, light = f"capture {job.capture}", ready.capture[ready.valid]
-    # Parts of the capture's variation, which is a smaller number than its norm.
-    unit = float(np.sqrt(np.mean(light.astype(float) ** 2)) / max(light.std(), 1e-30))
-    left = done.relative_residual * unit
-    if left > _SUSPECT and left > 3 * done.pixel_deviation / max(float(light.std()), 1e-30):
+    where, light = f"capture {job.capture}", ready.capture[ready.valid].astype(float)
+    varies = max(float(light.std()), 1e-30)
+    left = done.relative_residual * float(np.sqrt(np.mean(light**2))) / varies
+    if left > max(_SUSPECT, 3 * done.pixel_deviation / varies):
         yield finding("unexplained", where, 100 * left, True)
-    given, found = done.noise, pixel_noise(ready).counts
-    if given.found == "given" and not given.counts / 3 <= found <= 3 * given.counts:
-        yield finding("noise", where, found, False, f"{given.counts:g}")
+    given, found = done.noise.counts, pixel_noise(ready).counts
+    if done.noise.found == "given" and not given / 3 <= found <= 3 * given:
+        yield finding("noise", where, found, False, f"{given:g}")
 
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
