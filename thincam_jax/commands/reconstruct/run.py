@@ -128,7 +128,7 @@ class Rig:
         self.background = _background(sources.background, sources.bits)
         self.psf_background = _background(sources.psf_background, psf_bits)
         self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
-        self.told: set[str] = set()
+        self.warned: set[str] = set()
 
     def examine(self, capture: Path, focus: int = 0) -> Examination:
         image = measured.read_image(capture, self.sources.bits)
@@ -147,8 +147,8 @@ class Rig:
     def tell(self, findings: Sequence[Finding], strict: bool) -> None:
         """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
         lines = [str(one) for one in findings]
-        terminal.warn([line for line in lines if line not in self.told])
-        self.told.update(lines)
+        terminal.warn([line for line in lines if line not in self.warned])
+        self.warned.update(lines)
         if bad := [str(one) for one in findings if strict and one.severe]:
             raise measured.MeasurementError(f"{bad[0]} (an error by --strict)")
 
