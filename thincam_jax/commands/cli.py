@@ -18,14 +18,14 @@ from thincam_jax.commands.capture.command import capture, known_drivers, preview
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
 from thincam_jax.commands.kinds import init, load_experiment
-from thincam_jax.commands.reconstruct.command import check, reconstruct
+from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import WRONG_INPUT, reported, say, say_result, tell
 
 ORDER = (
-    *("init", "explain", "explore", "run", "preview", "capture", "reconstruct", "calibrate"),
-    *("sweep", "design", "train", "bench", "schema", "doctor"),
+    *("init", "explain", "explore", "run", "preview", "capture", "examine", "reconstruct"),
+    *("calibrate", "sweep", "design", "train", "bench", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -137,6 +137,7 @@ for group, command, *examples in (
     (app, train, "train learned.yaml", "train learned.yaml --resume"),
     (app, preview, "preview rig_virtual.yaml"),
     (app, capture, "capture rig_virtual.yaml", "capture rig.yaml --out frames.zarr --resume"),
+    (app, examine, "examine RAW.tif --psf PSF.tif", "examine CAPTURES/*.tif --json"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
 ):
     layout = Grouped if command in (reconstruct, check) else None

@@ -206,6 +206,8 @@ def _in_full_scale(raw: Raw) -> np.ndarray:
 
 
 def _saturated(raw: Raw, planes: np.ndarray, options: Preparation) -> np.ndarray:
+    if raw.saturation is not None and options.saturation is None:
+        return planes >= np.float32(raw.saturation) / np.float32(raw.full_scale)
     if raw.bits is None and options.saturation is None:
         return np.zeros(planes.shape, bool)
     return planes >= np.float32(options.saturation or 1.0)

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
-from thincam_jax.commands.terminal import Overrides, reported, say_result
+from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, reported, say_result
 
 # What works from a measured PSF and prepared captures; "auto" then is admm-tv.
 METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
@@ -37,6 +37,7 @@ Bayer = Annotated[
     Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
     Option(help="Colours of the mosaic, from its upper left."),
 ]
+Strict = Annotated[bool, Option("--strict", help="Severe findings are errors: exit code 2.")]
 Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")]
 
 
@@ -116,6 +117,7 @@ def reconstruct(
     white_balance: Annotated[
         str | None, Option(help="Of the PNG: grey-world, or gains as 1.8,1,1.4.")
     ] = None,
+    strict: Strict = False,
 ) -> None:
     """Reconstruct captures with a measured PSF, or with that of a camera's numbers.
 
@@ -162,6 +164,7 @@ def reconstruct(
             ridge=ridge,
             noise=noise,
             focusing=focusing,
+            strict=strict,
         )
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
         output = Output(out, linear, gamma, balance, unsure)
@@ -234,3 +237,24 @@ def check(
     say_result("findings", lines, "\n".join(lines))
     if not fits:
         raise typer.Exit(1)
+
+
+def examine(
+    files: Annotated[list[Path], Argument(help="Captures of one camera.")],
+    psf: Annotated[Path | None, Option(help="Their measured PSF.")] = None,
+    bits: Bits = None,
+    bayer: Bayer = None,
+    strict: Strict = False,
+) -> None:
+    """Examine captures and a PSF for what spoils an image, without reconstructing any."""
+    with reported(lambda: "interrupted; nothing is known of the files"):
+        from thincam_jax.measured import Preparation, read_image
+        from thincam_jax.measured.examination import examine as examined
+
+        captures = [read_image(path, bits) for path in files]
+        light = None if psf is None else read_image(psf, bits)
+        found = examined(captures, light, Preparation(bayer=bayer)).findings
+    lines = [f"{'severe: ' if one.severe else ''}{one}" for one in found]
+    say_result("findings", [vars(one) for one in found], "\n".join(lines) or "nothing found")
+    if strict and any(one.severe for one in found):
+        raise typer.Exit(WRONG_INPUT)

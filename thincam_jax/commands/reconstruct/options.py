@@ -89,6 +89,7 @@ class Recipe:
     - `ridge`: of the method "ridge", which has neither tau nor coupling; None: 1.
     - `noise`: standard deviation of a raw pixel's noise, counts; None: estimated.
     - `focusing`: a network; `method` is then "learned", and nothing else of it is used.
+    - `strict`: severe findings of the examination are errors.
 
     **Errors**: MeasurementError for what is unknown or out of range.
     """
@@ -102,6 +103,7 @@ class Recipe:
     ridge: float | int | None = None
     noise: float | int | None = None
     focusing: Focusing | None = None
+    strict: bool = False
 
     def __post_init__(self):
         self._check_method()

@@ -19,6 +19,7 @@ from thincam_jax.commands.interrupt import INTERRUPTED
 from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
+from thincam_jax.measured.examination import Examination, Finding, examine, finding
 from thincam_jax.measured.options import by_files
 from thincam_jax.measured.write import LINEAR, linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver, refine
@@ -36,6 +37,7 @@ from thincam_jax.studies.prepared import (
 
 _SIDE = 160  # pixels of the longer side, about: enough for half a per cent of scale
 _UNEXPLAINED = 0.9  # of the capture's norm
+_SUSPECT = 0.3  # of the capture's variation
 _BRIGHTEST = 0.8  # of full scale, of a PSF that is written: it has not saturated
 
 Report = Callable[[str, Progress], None]
@@ -49,6 +51,7 @@ class Finished:
       its capture, or nothing.
     - `status`: see `Reconstruction.ending`.
     - `marked`: the image with its uncertain pixels marked, as a PNG.
+    - `findings`: of the image's residual and noise.
     """
 
     job: Job
@@ -59,6 +62,7 @@ class Finished:
     status: str = ""
     iterations: int = 0
     marked: bytes = b""
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -124,12 +128,29 @@ class Rig:
         self.background = _background(sources.background, sources.bits)
         self.psf_background = _background(sources.psf_background, psf_bits)
         self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
+        self.warned: set[str] = set()
+
+    def examine(self, capture: Path, focus: int = 0) -> Examination:
+        image = measured.read_image(capture, self.sources.bits)
+        return examine([image], self.psfs[focus], self.sources.preparation)
 
     def prepare(self, capture: Path, focus: int = 0) -> measured.Prepared:
-        psf, image = self.psfs[focus], measured.read_image(capture, self.sources.bits)
+        return self.ready(self.examine(capture, focus))
+
+    def ready(self, examined: Examination) -> measured.Prepared:
+        psf, (image,) = examined.psf, examined.captures
+        assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}
         given = self.background, self.sources.preparation
         return measured.prepare(psf, image, **by_files(psf, image, *given, **known))
+
+    def tell(self, findings: Sequence[Finding], strict: bool) -> None:
+        """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
+        lines = [str(one) for one in findings]
+        terminal.warn([line for line in lines if line not in self.warned])
+        self.warned.update(lines)
+        if bad := [str(one) for one in findings if strict and one.severe]:
+            raise measured.MeasurementError(f"{bad[0]} (an error by --strict)")
 
 
 def _background(given: Background, bits: int | None) -> measured.Raw | float | None:
@@ -138,19 +159,24 @@ def _background(given: Background, bits: int | None) -> measured.Raw | float | N
 
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report | None) -> Finished:
     began = time.perf_counter()
-    ready = rig.prepare(job.capture, job.focus or 0)
+    examined = rig.examine(job.capture, job.focus or 0)
+    ready = rig.ready(examined)
     _check_channels(job, ready, recipe, output)
+    rig.tell(examined.findings, recipe.strict)
     noise = pixel_noise(ready, recipe.noise)
     if recipe.focusing is None:
         made = _reconstruct(job, ready, recipe, noise, report)
     else:
         made = _focus(job, ready, recipe.focusing, noise)
+    findings = (*examined.findings, *made.findings)
+    rig.tell(() if made.doubt and not recipe.strict else findings, recipe.strict)
     image = made.image[:, ::-1, ::-1] if recipe.flip else made.image
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
     record = {
         "capture": job.capture,
         "sources": _source_facts(rig.sources),
         "preparation": asdict(ready.log),
+        "examination": [asdict(one) for one in findings],
         "reconstruction": made.record | {"noise": {"counts": noise.counts, "found": noise.found}},
         "image": {
             "shape": image.shape,
@@ -241,7 +267,21 @@ def _reconstruct(
         f"({noise.found.split()[0]})"
     )
     image, facts = done.image(recipe.field), _facts(done, recipe)
-    return Finished(job, facts, image, line, doubt, found.status, found.iterations)
+    findings = () if found.status == "interrupted" else tuple(_doubts(job, ready, done))
+    ending = found.status, found.iterations, b"", findings
+    return Finished(job, facts, image, line, doubt, *ending)
+
+
+def _doubts(job: Job, ready: measured.Prepared, done: PreparedResult) -> Iterator[Finding]:
+    """A residual far above the noise, and a given noise that is not the one found."""
+    where, light = f"capture {job.capture}", ready.capture[ready.valid].astype(float)
+    varies = max(float(light.std()), 1e-30)
+    left = done.relative_residual * float(np.sqrt(np.mean(light**2))) / varies
+    if left > max(_SUSPECT, 3 * done.pixel_deviation / varies):
+        yield finding("unexplained", where, 100 * left, True)
+    given, found = done.noise.counts, pixel_noise(ready).counts
+    if done.noise.found == "given" and not given / 3 <= found <= 3 * given:
+        yield finding("noise", where, found, False, f"{given:g}")
 
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
@@ -382,6 +422,8 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
                 bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
             else:
                 say_result("image", result.job.images[0])
+                if found := result.record.get("examination"):
+                    say_result("findings", found)
             if result.job.focus is None:
                 continue
             if result.doubt:

@@ -1,0 +1,259 @@
+"""Examination of captures and a PSF as they came in: values in them that measure no light."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+from jaxtyping import Bool, Float, Shaped
+
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.grids import block_mean, central_blocks
+from thincam_jax.measured.options import Preparation
+from thincam_jax.measured.raw import Raw
+
+_FEW = 20  # pixels at one value that a clean image may have
+_STEEP = 3.0  # times as many pixels as at each of the values below
+_ISOLATED = 3.0  # times the range of the neighbours, by which a defective pixel exceeds them
+_CERTAIN = 8.0  # standard deviations of the noise, or counts
+_SPREAD = 0.1  # share of a point of light that its neighbours have at least
+_DIM, _SATURATED, _BORDER, _COLOURED = 2.0, 5.0, 10.0, 3.0  # %
+_TILES, _COARSE = 8, 64
+_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
+_OUTER = np.flatnonzero(np.pad(np.zeros((3, 3)), 1, constant_values=1))  # of 5×5 pixels
+# Unit and consequence, and what mends it.
+_TEXTS = {
+    "plateau": "% of the pixels have the largest value, {}, and are not used; give {} to say so",
+    "flat": "% of the pixels have the largest value, {}, where the light is cut off; expose less",
+    "defective": "hot or dead pixels are not used; give a map of them with --dead",
+    "replaced": "hot or dead pixels are filled by their neighbours; subtract a dark frame",
+    "mosaic": "% is the step between pixels, as of a colour sensor, which shows; give --bayer {}",
+    "no mosaic": "% is the step between pixels, not as of a colour sensor; leave --bayer out",
+    "overexposed": "% of the pixels are saturated: the image is a guess there; expose less",
+    "underexposed": "% of full scale is the brightest part; expose longer, or give its --bits",
+    "cut": "% of its peak varies along its border: what is beyond is missing; compute it: --camera",
+    "swapped": "% is not explained by the PSF, which it explains; exchange --psf and --capture",
+    "unexplained": "% of its variation is neither image nor noise; try thincam calibrate check",
+    "noise": "counts of noise are found, and {} are given; leave --noise out if that is unsure",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault of an image: its `number`, whose unit begins `consequence`, and what mends it."""
+
+    name: str
+    where: str
+    number: float
+    consequence: str
+    advice: str
+    severe: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.number:.3g} {self.consequence}; {self.advice}"
+
+
+def finding(name: str, where: str, number: float, severe: bool = False, *words: str) -> Finding:
+    """Finding of a kind in `_TEXTS`, filled with `words`."""
+    consequence, _, advice = _TEXTS[name].format(*words).partition("; ")
+    return Finding(name, where, float(number), consequence, advice, severe)
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """Findings, and the images: plateaus are saturation, defective pixels dead, or filled."""
+
+    findings: tuple[Finding, ...]
+    captures: tuple[Raw, ...]
+    psf: Raw | None = None
+
+
+@checked
+def examine(
+    captures: Sequence[Raw], psf: Raw | None = None, options: Preparation | None = None
+) -> Examination:
+    """Examine raw captures of one camera and their PSF for faults that decide the image.
+
+    `options` of the preparation that follows: the Bayer pattern and the saturation.
+
+    - plateau: many pixels share the largest value, and few each of the next lower ones.
+    - defective: single pixels beyond all neighbours of their colour by a multiple of their range,
+      without the blur of light, in most of the captures, in images without structure as fine.
+    - mosaic: the means of the pixels of 2×2 differ, but not those of one diagonal, green.
+    - exposure, and a PSF whose light varies along its border; a computed one is not examined.
+    - swapped: the capture as PSF explains the PSF as capture, and not the reverse.
+    """
+    options = options or Preparation()
+    is_measured = psf is not None and psf.sensor_shape is None
+    images, count = [*captures, psf] if is_measured else [*captures], len(captures)
+    findings: list[Finding] = []
+    maps = [defective_pixels(raw, _mosaic(raw, options)) for raw in images]
+    for n, odd in enumerate(maps):
+        is_psf, raw = n == count, images[n]
+        where = f"{'PSF' if is_psf else 'capture'} {raw.name}"
+        images[n] = raw = _examined(raw, where, options, findings)
+        same = [one for one in maps[:count] if one.shape == odd.shape]
+        if is_psf and odd.any():
+            findings.append(finding("replaced", where, float(odd.sum())))
+            images[n] = _filled(raw, odd, _mosaic(raw, options))
+        elif not is_psf and (odd := odd & (2 * np.sum(same, axis=0) > len(same))).any():
+            findings.append(finding("defective", where, float(odd.sum())))
+            images[n] = replace(raw, dead=odd if raw.dead is None else odd | raw.dead)
+    if is_measured and captures and images[0].pixels.shape[:2] == images[-1].pixels.shape[:2]:
+        left, other = _unexplained(images[-1], images[0]), _unexplained(images[0], images[-1])
+        if 0 < other < left / 2:
+            findings.append(finding("swapped", f"capture {images[0].name}", 100 * left, True))
+    return Examination(tuple(findings), tuple(images[:count]), images[-1] if is_measured else psf)
+
+
+def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
+    """Count the pixels at the largest value where more than noise puts there, else 0."""
+    below = pixels[pixels < pixels.max()]
+    count = pixels.size - below.size
+    if count < _FEW or below.size < _FEW:
+        return 0
+    kept = min(below.size, below.size // 8 + 1000)
+    _, counts = np.unique(np.partition(below, -kept)[-kept:], return_counts=True)
+    return count if counts.size >= 16 and count > _STEEP * counts[-8:].max() else 0
+
+
+def defective_pixels(raw: Raw, is_mosaic: bool = False) -> Bool[np.ndarray, "y x"]:
+    """Map of single pixels that differ from all neighbours of their colour as no light does."""
+    found = np.zeros(raw.pixels.shape[:2], bool)
+    for part in _phases(is_mosaic):
+        planes = np.atleast_3d(raw.pixels[part]).astype(np.float32)
+        for plane in np.moveaxis(planes, -1, 0):
+            found[part] |= _defective(plane, float(raw.pixels.dtype.kind == "u"))
+    return found if raw.dead is None else found & ~raw.dead
+
+
+def _defective(plane: np.ndarray, step: float) -> np.ndarray:
+    """`defective_pixels` of one colour; `step`: of its values."""
+    if min(plane.shape) < 8:
+        return np.zeros(plane.shape, bool)
+    high = scipy.ndimage.maximum_filter(plane, footprint=_RING, mode="mirror")
+    low = scipy.ndimage.minimum_filter(plane, footprint=_RING, mode="mirror")
+    beyond = np.maximum(plane - high, low - plane)
+    middle, top = np.percentile(plane, [50, 99.5])
+    floor = max(_CERTAIN * max(_noise(plane), step), 0.01 * (top - middle))
+    odd = beyond > np.maximum(_ISOLATED * (high - low), floor)
+    rows, columns = np.nonzero(odd)
+    if not 0 < rows.size <= max(_FEW, odd.size // 100):
+        return np.zeros_like(odd)
+    # Light of a point reaches the neighbours; a defect does not raise them above what is around.
+    padded = np.pad(plane, 2, mode="reflect")
+    squares = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))[rows, columns]
+    cross = squares[:, [1, 2, 2, 3], [2, 1, 3, 2]].mean(axis=1)
+    outer = np.median(squares.reshape(-1, 25)[:, _OUTER], axis=1)
+    sign = np.sign(plane[rows, columns] - cross)
+    odd[rows, columns] = sign * (cross - outer) <= _SPREAD * beyond[rows, columns]
+    # A mask as fine as a pixel, or points that are all the light there is, are no defects.
+    around = scipy.ndimage.binary_dilation(odd, np.ones((5, 5), bool))
+    base = scipy.ndimage.minimum_filter(plane, 5, mode="mirror")
+    mean = (9 * scipy.ndimage.uniform_filter(plane, 3, mode="mirror") - plane) / 8
+    sharp = (plane - base > floor) & (mean - base < 0.25 * (plane - base)) & ~around
+    light = np.maximum(np.abs(plane - middle) - floor / 2, 0)
+    is_structure = 2 * sharp.sum() > odd.sum() or light[odd].sum() > 0.3 * light.sum()
+    return odd & ~is_structure
+
+
+def _noise(plane: np.ndarray) -> float:
+    """Standard deviation of noise, by the median of second differences along rows."""
+    bend = plane[:, 1:-1] - (plane[:, 2:] + plane[:, :-2]) / 2
+    return 1.21 * float(np.median(np.abs(bend)))
+
+
+def _filled(raw: Raw, odd: np.ndarray, is_mosaic: bool) -> Raw:
+    pixels = raw.pixels.copy()
+    ring = _RING if raw.pixels.ndim == 2 else _RING[..., None]
+    for part in _phases(is_mosaic):
+        around = scipy.ndimage.median_filter(raw.pixels[part], footprint=ring, mode="mirror")
+        pixels[part][odd[part]] = around[odd[part]]
+    return replace(raw, pixels=pixels)
+
+
+def _phases(is_mosaic: bool) -> list[tuple[slice, slice]]:
+    step = 2 if is_mosaic else 1
+    return [np.s_[i::step, j::step] for i in range(step) for j in range(step)]
+
+
+def _mosaic(raw: Raw, options: Preparation) -> bool:
+    return raw.pixels.ndim == 2 and (options.bayer or raw.bayer) is not None
+
+
+def _grey(raw: Raw) -> Float[np.ndarray, "y x"]:
+    return np.atleast_3d(raw.pixels).mean(axis=2, dtype=np.float32)
+
+
+def _examined(raw: Raw, where: str, options: Preparation, found: list[Finding]) -> Raw:
+    """An image with its plateau as saturation; what histogram and colours say is added."""
+    is_psf, image, is_mosaic = where.startswith("PSF"), _grey(raw), _mosaic(raw, options)
+    full, top, count = raw.full_scale, float(raw.pixels.max()), plateau(raw.pixels)
+    level = full * (options.saturation or (1.0 if raw.bits else np.inf))
+    if count and options.saturation is None and top < level:
+        bits = max(8, math.ceil(np.log2(top + 1)))  # of a camera
+        given, most = ("", full) if 2**bits - 1 != top <= full else (f"--bits {bits}", 2**bits - 1)
+        given += f" --saturation {0.99999 * top / most:.6f}" * (top < most or not given)
+        share, words = 100 * count / raw.pixels.size, (f"{top:g}", given.strip())
+        kind, severe = ("flat", share > 1) if is_psf else ("plateau", False)
+        found.append(finding(kind, where, share, severe, *words))
+        level, raw = top, replace(raw, saturation=top)
+    share = 100 * float(np.mean(raw.pixels >= level))
+    if not is_psf and share > _SATURATED:
+        found.append(finding("overexposed", where, share, share > 50))
+    low, high = np.percentile(raw.pixels, [1, 99.9])
+    bright = 100 * (high - (low if raw.black_level is None else raw.black_level)) / full
+    if raw.bits is not None and bright < _DIM:
+        found.append(finding("underexposed", where, bright))
+    difference, error, pattern = _phase_difference(image)
+    if raw.channels == 1 and pattern and not is_mosaic:
+        found.append(finding("mosaic", where, difference, True, pattern))
+    elif not is_psf and is_mosaic and difference + 3 * error < _COLOURED:
+        found.append(finding("no mosaic", where, difference))
+    if is_psf and (change := _border(image)) > _BORDER:
+        found.append(finding("cut", where, change))
+    return raw
+
+
+def _phase_difference(image: np.ndarray) -> tuple[float, float, str]:
+    """Difference of the means of the pixels of 2×2, its error, %, and the patterns it may be of.
+
+    It has to be the same in most of 8×8 tiles, and two pixels of a diagonal, green, to agree.
+    """
+    tile = [n // (2 * _TILES) for n in image.shape]
+    if min(tile) < 2:
+        return 0.0, np.inf, ""
+    rows, columns = (2 * _TILES * n for n in tile)
+    cells = image[:rows, :columns].reshape(_TILES, tile[0], 2, _TILES, tile[1], 2)
+    parts = cells.mean(axis=(1, 4)).transpose(0, 2, 1, 3).reshape(-1, 4)
+    parts = parts - parts.mean(axis=1, keepdims=True)
+    parts *= 100 / max(float(image.mean() - np.percentile(image, 1)), 1e-30)
+    means, error = parts.mean(axis=0), parts.std(axis=0) / len(parts) ** 0.5
+    greens = np.abs([means[1] - means[2], means[0] - means[3]])
+    clear = np.ptp(means) > _COLOURED and (np.abs(means) > 6 * error).sum() >= 2
+    clear = clear and greens.min() < 0.3 * np.ptp(means)
+    patterns = ("RGGB or BGGR", "GRBG or GBRG")[int(np.argmin(greens))]
+    return float(np.ptp(means)), float(error.max()), patterns if clear else ""
+
+
+def _border(image: np.ndarray) -> float:
+    """Change of light along the border beyond noise, % of the peak; 0 of a uniform background."""
+    size, blurred = max(4, min(image.shape) // 16), scipy.ndimage.uniform_filter1d
+    strips = [blurred(image[[0, -1]], size, axis=1), blurred(image[:, [0, -1]], size, axis=0)]
+    first, last = np.percentile(np.concatenate([one.ravel() for one in strips]), [10, 90])
+    low, high = np.percentile(image, [5, 99.9])
+    return 100 * (last - first - 6 * _noise(image) / size**0.5) / max(high - low, 1e-30)
+
+
+def _unexplained(psf: Raw, capture: Raw) -> float:
+    """Part of a coarse capture's norm that a regularised inverse leaves."""
+    spectra = []
+    for image in (_grey(psf), _grey(capture)):
+        size = max(1, min(image.shape) // _COARSE)
+        image = block_mean(image[central_blocks(image.shape, size)], size)
+        rows, columns = (np.hanning(n) for n in image.shape)
+        spectra.append(np.fft.rfft2((image - image.mean()) * np.outer(rows, columns)))
+    power = np.abs(spectra[0]) ** 2 / max(float(np.max(np.abs(spectra[0]) ** 2)), 1e-30)
+    left = np.linalg.norm(1e-3 / (power + 1e-3) * spectra[1])
+    return float(left / max(np.linalg.norm(spectra[1]), 1e-30))
