@@ -106,15 +106,16 @@ def _whole(value: Any) -> bool:
 def by_files(
     psf: Raw,
     capture: Raw,
-    background: Any = None,
-    options: Preparation | None = None,
-    *,
-    psf_background: Any = None,
-    dead: np.ndarray | None = None,
-) -> dict[str, Any]:
-    """Arguments of `prepare`, by the files where nothing is given: pattern, black levels.
+    background: Any,
+    options: Preparation | None,
+    psf_background: Any,
+    dead: np.ndarray | None,
+) -> tuple[Preparation, dict[str, Any], np.ndarray | None]:
+    """Options, backgrounds of "psf" and "capture", and dead pixels of a preparation.
 
-    Dead pixels join those that are given. **Errors**: MeasurementError for two patterns.
+    By the files where nothing is given: pattern, black levels; their dead pixels join those that
+    are given. A background that nobody knows is "found". **Errors**: MeasurementError for two
+    patterns.
     """
     options = options or Preparation()
     stated = dict.fromkeys(raw.bayer for raw in (capture, psf) if raw.bayer)
@@ -125,14 +126,21 @@ def by_files(
         )
     if options.bayer is None and stated and psf.channels == capture.channels == 1:
         options = replace(options, bayer=next(iter(stated)))
-    if background is None and psf_background is None:
-        psf_background = psf.black_level
-    background = capture.black_level if background is None else background
+    levels = [raw.black_level for raw in (capture, psf)]
+    if background is None or _is(background, "found"):
+        background = "found" if levels[0] is None else levels[0]
+        psf_background = "found" if psf_background is None else psf_background
+    psf_background = background if psf_background is None else psf_background
+    if _is(psf_background, "found"):
+        psf_background = next((level for level in levels[::-1] if level is not None), "found")
     for raw in (capture, psf):
         if raw.dead is not None and raw.dead.shape == capture.pixels.shape[:2]:
             dead = raw.dead if dead is None else dead | raw.dead
-    names = "background", "options", "psf_background", "dead"
-    return dict(zip(names, (background, options, psf_background, dead), strict=True))
+    return options, {"psf": psf_background, "capture": background}, dead
+
+
+def _is(background: Any, name: str) -> bool:
+    return isinstance(background, str) and background == name
 
 
 def _check_file(name: str, raw: Raw, background: Any, dead: Any, options: Preparation) -> None:
@@ -221,9 +229,10 @@ def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
                 f"{_scale(raw)}; read both with the same `bits`"
             )
     elif isinstance(background, str):
-        if background != "corner":
+        if background not in ("corner", "found"):
             raise MeasurementError(
-                f"background = {background!r}: give a dark frame, a number of counts or 'corner'"
+                f"background = {background!r}: give a dark frame, a number of counts, 'corner' or "
+                "'found'"
             )
         if raw.bits != psf.bits:
             raise MeasurementError(

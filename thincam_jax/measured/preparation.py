@@ -1,6 +1,7 @@
 """Preparation of a measured PSF and a capture for a reconstruction."""
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,12 +12,13 @@ from jaxtyping import Bool, Float, Float32
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaiced
-from thincam_jax.measured.options import Centre, Preparation, check_match
+from thincam_jax.measured.dark import Found, corner_levels, find_levels
+from thincam_jax.measured.options import Centre, Preparation, by_files, check_match
 from thincam_jax.measured.preparation_log import Centring, CleanUp, ImageLog, PreparationLog
 from thincam_jax.measured.raw import MeasurementError, Raw
 from thincam_jax.measured.sensor import SensorCalibration
 
-Background = Raw | SensorCalibration | float | int | Literal["corner"]
+Background = Raw | SensorCalibration | float | int | Literal["corner", "found"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +71,14 @@ def prepare(
     The steps, of which the result's `log` tells:
 
     1. Counts to fractions of full scale, float32.
-    2. Background: subtract a dark frame (of the image's exposure), a number of counts, or
-       "corner", the default: the mean of a square in the PSF's upper left corner, for both images,
-       because a lensless capture has no dark place. 0 subtracts nothing. A `SensorCalibration` `at`
-       the image's exposure also divides by the response of each pixel and gives the variance.
-       `psf_background` is that of the PSF where it differs. Negative values become 0.
+    2. Background: subtract a dark frame (of the image's exposure), or a number of counts; 0
+       subtracts nothing. None or "found": the black level of the image's file, else that of a
+       corner of the PSF that proves dark (see `find_levels`), else the lowest value for the PSF
+       and nothing for the capture, whose uniform background is then found with the image.
+       "corner": the mean of a square in the PSF's upper left corner, untested, for both. A
+       `SensorCalibration` `at` the image's exposure also divides by the response of each pixel and
+       gives the variance. `psf_background` is that of the PSF where it differs. Negative values
+       become 0.
     3. Saturated pixels (before the subtraction), `dead` ones, True in a map (y, x) of the sensor
        (`read_mask`), and defective ones by the calibration are not valid.
     4. Demosaicing, if the options name a Bayer pattern; then the capture's `crop`.
@@ -90,31 +95,24 @@ def prepare(
     the PSF are only counted in the log; they call for a PSF of shorter exposure.
 
     **Errors**: MeasurementError, one line: incompatible sizes, channels or bit depths, a black PSF
-    or capture.
+    or capture. **Warns** where no corner of the PSF is dark.
+
+    Pattern, black levels and dead pixels that nobody gives are those of the files.
     """
-    options = options or Preparation()
-    background = "corner" if background is None else background
-    backgrounds: dict[str, Background] = {
-        "psf": background if psf_background is None else psf_background,
-        "capture": background,
-    }
+    options, backgrounds, dead = by_files(psf, capture, background, options, psf_background, dead)
     raws = {"psf": psf, "capture": capture}
     check_match(psf, capture, backgrounds, dead, options)
     planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
-    square = slice(None), slice(*options.corner), slice(*options.corner)
-    corner = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
-    corner = corner.astype(np.float32)
-    corners = {"psf": corner, "capture": corner}
-    if options.psf_channels == "mean" and psf.channels != capture.channels:
-        corners["capture"] = corner.mean(axis=0, keepdims=True)
-    levels = {n: _level(b, raws[n], corners[n]) for n, b in backgrounds.items()}
+    found = _found(planes, backgrounds, raws, options)
+    levels = {n: _level(b, raws[n], found.levels[n]) for n, b in backgrounds.items()}
     good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
     frames = {
         n: _frame(raws[n], plane, backgrounds[n], levels[n], good, options)
         for n, plane in planes.items()
     }
-    noise = _noise(frames["psf"].values[square].astype(np.float64), options)
-    logs = {n: _image_log(raws[n], backgrounds[n], levels[n], f) for n, f in frames.items()}
+    noise = _noise(frames["psf"].values[found.square].astype(np.float64), options)
+    kinds = {n: _kind(b, raws[n], found.sources[n]) for n, b in backgrounds.items()}
+    logs = {n: _image_log(raws[n], kinds[n], levels[n], f) for n, f in frames.items()}
     frames = {n: replace(f, values=np.maximum(f.values, 0)) for n, f in frames.items()}
     if options.bayer is not None:
         frames = {n: _demosaiced(f, options) for n, f in frames.items()}
@@ -137,7 +135,7 @@ def prepare(
     sums, divisor = _psf_divisor(light, options), _capture_divisor(image, options)
     valid = frames["capture"].known & ~frames["capture"].saturated
     variance = np.where(valid, frames["capture"].variance / np.float32(divisor**2), np.inf)
-    variance = variance if isinstance(background, SensorCalibration) else None
+    variance = variance if isinstance(backgrounds["capture"], SensorCalibration) else None
     log = PreparationLog(
         options=options,
         psf=logs["psf"],
@@ -158,10 +156,34 @@ def prepare(
     return Prepared(light, image, valid, log, variance)
 
 
-def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Frame) -> ImageLog:
-    kind = background if isinstance(background, str) else "number"
+def _found(planes, backgrounds: dict[str, Background], raws, options: Preparation) -> Found:
+    """Levels of the images whose background is to be found, with a warning of what is not sure."""
+    sought = [name for name, one in backgrounds.items() if isinstance(one, str) and one == "found"]
+    if not sought:
+        side = slice(*options.corner)
+        return corner_levels(planes, (slice(None), side, side))
+    found = find_levels(planes, options.corner, options.bayer)
+    if "psf" in sought and found.sources["psf"] != "corner":
+        warnings.warn(
+            f"no corner of the PSF ({raws['psf'].name}) is dark: its lowest value is taken as its "
+            "black level; a background is better, a dark frame or a number of counts",
+            stacklevel=4,
+        )
+    return found
+
+
+def _kind(background: Background, raw: Raw, found: str) -> str:
+    """The source of a level, in words."""
     if isinstance(background, SensorCalibration):
-        kind = f"sensor's calibration at {background.exposure:g} s"
+        return f"sensor's calibration at {background.exposure:g} s"
+    if isinstance(background, Raw):
+        return f"dark frame {background.name}"
+    if isinstance(background, str):
+        return found
+    return "black level of the file" if background == raw.black_level else "number"
+
+
+def _image_log(raw: Raw, background: str, level: np.ndarray, frame: _Frame) -> ImageLog:
     maximum = raw.pixels.max()
     return ImageLog(
         name=raw.name,
@@ -172,7 +194,7 @@ def _image_log(raw: Raw, background: Background, level: np.ndarray, frame: _Fram
         minimum=float(raw.pixels.min()),
         maximum=float(maximum),
         pixels_at_maximum=int(np.count_nonzero(raw.pixels == maximum)),
-        background=f"dark frame {background.name}" if isinstance(background, Raw) else kind,
+        background=background,
         level=tuple(level.mean(axis=(1, 2), dtype=np.float64).tolist()),
         clipped=int(np.count_nonzero(frame.values < 0)),
         saturated=int(frame.saturated.sum()),
@@ -223,14 +245,14 @@ def _noise(part: np.ndarray, options: Preparation) -> np.ndarray:
     return spread / options.downsample
 
 
-def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
+def _level(background: Background, raw: Raw, found: np.ndarray) -> np.ndarray:
     """Level to subtract, in fractions of full scale."""
     if isinstance(background, Raw):
         return _in_full_scale(background)
     if isinstance(background, SensorCalibration):
         return background.dark_level[None] / np.float32(raw.full_scale)
     if isinstance(background, str):
-        return corner
+        return found
     return np.full((1, 1, 1), background / raw.full_scale, np.float32)
 
 

@@ -12,8 +12,9 @@ class ImageLog:
     - `name`, `format`, `shape`, `bits`, `full_scale`: of its file.
     - `minimum`, `maximum`: in counts. `pixels_at_maximum`: many have saturated, whatever the
       converter's highest level.
-    - `background`: "corner", "number" or the name of the dark frame; `level`: what was subtracted,
-      the mean of each channel in fractions of full scale.
+    - `background`: source of `level`, what was subtracted, the mean of each channel in fractions of
+      full scale: "corner", "number", "black level of the file", the name of the dark frame; "lowest
+      value" or "found with the image" where it is unknown.
     - `clipped`: pixels that this made negative, and that became 0.
     - `saturated`, `dead`: pixels. `noise`: by a sensor's calibration, root mean square, counts.
     """

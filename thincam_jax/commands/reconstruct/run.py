@@ -20,7 +20,6 @@ from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
 from thincam_jax.measured.examination import Examination, Finding, examine, finding
-from thincam_jax.measured.options import by_files
 from thincam_jax.measured.write import LINEAR, linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver, refine
 from thincam_jax.reconstruction.depth import depth_of_colours
@@ -141,8 +140,7 @@ class Rig:
         psf, (image,) = examined.psf, examined.captures
         assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}
-        given = self.background, self.sources.preparation
-        return measured.prepare(psf, image, **by_files(psf, image, *given, **known))
+        return measured.prepare(psf, image, self.background, self.sources.preparation, **known)
 
     def tell(self, findings: Sequence[Finding], strict: bool) -> None:
         """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
@@ -237,7 +235,8 @@ def _reconstruct(
     job: Job, ready: measured.Prepared, recipe: Recipe, noise: PixelNoise, report: Report | None
 ) -> Finished:
     """The image, unturned; its record is of the method alone."""
-    solver = recipe.solver(len(ready.capture))
+    unknown = ready.log.capture.background == "found with the image"
+    solver = recipe.solver(len(ready.capture), unknown)
     # Conjugate gradients are one compiled program, without progress.
     callback = None if report is None or recipe.is_ridge else partial(report, job.name)
     done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
@@ -296,7 +295,7 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
         "ridge": recipe.relative_ridge if recipe.is_ridge else None,
         "variation": {"kind": prior.kind, "coupling": prior.coupling} if has_tau else None,
         "nonnegative": problem.nonnegative and not recipe.is_ridge,
-        "iterations_at_most": getattr(recipe.solver(1), "iterations", None),
+        "iterations_at_most": getattr(done.solver, "iterations", None),
     }
 
 

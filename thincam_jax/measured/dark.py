@@ -1,0 +1,85 @@
+"""Black levels that nobody gave: dark corners of a PSF, tested, or its lowest value."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+
+from thincam_jax._core.grids import block_sum, central_blocks
+from thincam_jax.measured.bayer import Pattern
+
+_LIT = 0.15  # largest part of the mean light that a dark place may hold
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Levels (channel, 1, 1) of "psf" and "capture", how they were found, and the PSF's corner."""
+
+    levels: dict[str, np.ndarray]
+    sources: dict[str, str]
+    square: tuple[Any, ...]
+
+
+def corner_levels(planes: Mapping[str, np.ndarray], square: tuple[Any, ...]) -> Found:
+    """Means of a square of the PSF, for both images."""
+    level = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
+    level = level.astype(np.float32)
+    mean = level.mean(axis=0, keepdims=True)
+    levels = {"psf": level, "capture": level if len(level) == len(planes["capture"]) else mean}
+    return Found(levels, dict.fromkeys(levels, "corner"), square)
+
+
+def find_levels(
+    planes: Mapping[str, np.ndarray], corner: tuple[int, int], bayer: Pattern | None
+) -> Found:
+    """Find black levels of a PSF and a capture (channel, y, x), both in parts of one full scale.
+
+    The mean of the PSF's first corner that `is_dark`, beginning with the upper left. A capture that
+    is darker than that was exposed otherwise: nothing is subtracted, and its level is found with
+    the image. Without a dark corner the level of the PSF is the lowest median of 3×3 pixels of both
+    images, which no black level exceeds, and nothing is subtracted of the capture.
+
+    - `corner`: start and stop of a square, from each corner.
+    """
+    side = corner[1] - corner[0]
+    squares = [(slice(None), *square) for square in _corners(planes["psf"].shape, corner)]
+    for square in squares:
+        found = corner_levels(planes, square)
+        if is_dark(planes["psf"], found.levels["psf"], side):
+            if not is_dark(planes["capture"], found.levels["capture"], side):
+                found.sources["capture"] = "found with the image"
+                found.levels["capture"] = np.zeros((1, 1, 1), np.float32)
+            return found
+    lowest = np.float32(min(_lowest(one, bayer) for one in planes.values())).reshape(1, 1, 1)
+    levels = {"psf": lowest, "capture": np.zeros_like(lowest)}
+    sources = {"psf": "lowest value", "capture": "found with the image"}
+    return Found(levels, sources, squares[0])
+
+
+def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
+    """Whether a level is as low as the darkest square of an image (channel, y, x).
+
+    Above the darkest of all squares of `side` pixels, it lies by at most 15 % of what the mean of
+    the image does.
+    """
+    side = min(side, *image.shape[1:])
+    kept = image[:, *central_blocks(image.shape[1:], side)]
+    means = block_sum(kept, side, np.float64) / side**2
+    lowest = means.min(axis=(1, 2), keepdims=True)
+    light = means.mean(axis=(1, 2), keepdims=True) - lowest
+    return bool((level - lowest <= _LIT * light).all())
+
+
+def _corners(shape: tuple[int, ...], corner: tuple[int, int]) -> list[tuple[slice, slice]]:
+    """The same square from each corner."""
+    start, stop = corner
+    rows, columns = ((slice(start, stop), slice(n - stop, n - start)) for n in shape[-2:])
+    return [(row, column) for row in rows for column in columns]
+
+
+def _lowest(image: np.ndarray, bayer: Pattern | None) -> float:
+    """Lowest median of 3×3 pixels of one colour."""
+    colours = [image] if bayer is None else [image[:, i::2, j::2] for i in (0, 1) for j in (0, 1)]
+    return float(min(scipy.ndimage.median_filter(one, (1, 3, 3)).min() for one in colours))
