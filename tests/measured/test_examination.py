@@ -11,7 +11,6 @@ import thincam_jax as tc
 from thincam_jax.measured import Preparation, Raw, prepare
 from thincam_jax.measured.bayer import mosaic
 from thincam_jax.measured.examination import defective_pixels, examine
-from thincam_jax.measured.options import by_files
 from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
 
 SHAPE, DARK = (90, 116), 64
@@ -103,7 +102,7 @@ def image_of(psf, capture, background: float = DARK, options=None, iterations=40
 
 
 def plain_image(psf, capture, background: float = DARK, options=None, iterations=40):
-    ready = prepare(psf, capture, **by_files(psf, capture, background, options))
+    ready = prepare(psf, capture, background, options)
     solver = tc.AdmmTV(iterations=iterations)
     return reconstruct_prepared(ready, solver, pixel_noise(ready)).image()
 

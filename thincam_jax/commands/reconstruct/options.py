@@ -31,7 +31,6 @@ DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 
 # Far beyond any use; its product with the captures' units stays within float32.
 _LARGEST_TAU = 1e6
-_UNKNOWN_LEVEL = 300  # iterations
 
 Background = Path | float | int | None
 
@@ -135,11 +134,8 @@ class Recipe:
     def relative_ridge(self) -> float | int:
         return DEFAULT_RIDGE if self.ridge is None else self.ridge
 
-    def solver(self, channels: int, unknown_level: bool = False) -> AbstractSolver:
-        """The solver for a capture of so many colour channels.
-
-        An unknown level in the capture takes ADMM three times as many iterations.
-        """
+    def solver(self, channels: int) -> AbstractSolver:
+        """The solver for a capture of so many colour channels."""
         limit: dict[str, Any] = {} if self.iterations is None else {"iterations": self.iterations}
         if self.is_ridge:
             return Ridge(self.relative_ridge, **limit)
@@ -151,8 +147,6 @@ class Recipe:
         variation = TotalVariation(coupling=self.coupling or ("joint" if channels > 1 else "none"))
         if self.method == "fista":
             return Fista(self.relative_tau, regulariser=variation, **limit)
-        if unknown_level and self.iterations is None:
-            limit = {"iterations": _UNKNOWN_LEVEL}
         return AdmmTV(self.relative_tau, variation=variation, **limit)
 
     def _check_method(self) -> None:

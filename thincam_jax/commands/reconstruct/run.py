@@ -235,8 +235,7 @@ def _reconstruct(
     job: Job, ready: measured.Prepared, recipe: Recipe, noise: PixelNoise, report: Report | None
 ) -> Finished:
     """The image, unturned; its record is of the method alone."""
-    unknown = ready.log.capture.background == "found with the image"
-    solver = recipe.solver(len(ready.capture), unknown)
+    solver = recipe.solver(len(ready.capture))
     # Conjugate gradients are one compiled program, without progress.
     callback = None if report is None or recipe.is_ridge else partial(report, job.name)
     done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
