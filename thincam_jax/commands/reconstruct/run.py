@@ -262,7 +262,7 @@ def _reconstruct(
     line = (
         f"{found.status.replace('_', ' ')} after {found.iterations} iterations, relative data "
         f"residual {residual:.3g}, {found.seconds:.1f} s, noise {noise.counts:.3g} counts "
-        f"({noise.found.split()[0]})"
+        f"({noise.found.split()[0]})" + (f"; {found.reason}" if found.reason else "")
     )
     image, facts = done.image(recipe.field), _facts(done, recipe)
     findings = () if found.status == "interrupted" else tuple(_doubts(job, ready, done))
