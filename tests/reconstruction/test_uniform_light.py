@@ -28,6 +28,12 @@ PITCH = 0.2
 WIDE = (192, 224)  # pixels of a camera that is biased: an aperture of 224
 
 
+@pytest.fixture(autouse=True)
+def all_pixels_at_once(monkeypatch):
+    """The first part of the finest pixels, which else begin with an image of coarser ones."""
+    monkeypatch.setattr(methods, "_COARSER", 0)
+
+
 @pytest.fixture
 def low_bar(monkeypatch):
     """Small cameras are biased, too."""

@@ -279,12 +279,13 @@ class AdmmTV(AbstractRegularised):
     ):
         """Minimise by ADMM; without an image given first on coarser pixels.
 
-        If smooth light is left unexplained, once more with less weight on it; the outcome says so.
+        If it converged and leaves smooth light unexplained, once more with less weight on that;
+        the outcome says so.
         """
         if given:
             return self._by_admm(problem, image, callback)
         outcome = self._by_levels(problem, image, callback, _COARSER)
-        if outcome.status in ("stopped", "interrupted", "non_finite"):
+        if outcome.status != "converged":  # what is left is not yet misfit
             return outcome
         misfit = misfit_of(problem, outcome.image)
         if misfit is None:
