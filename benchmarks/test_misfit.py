@@ -10,10 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_background import score
 from test_prior import PHOTOGRAPHS
 
 import thincam_jax as tc
-from thincam_jax.imaging.metrics import align, psnr
 from thincam_jax.learn.refocusing import photographs
 from thincam_jax.reconstruction import smooth_misfit
 from thincam_jax.reconstruction.problem import forward
@@ -119,14 +119,6 @@ def recorded(optics, pixels, picture, kind, part):
         noise = light.std() * 10**-1.5 * rng.standard_normal(y.shape)
         captures.append(light * (1 + shade) + noise)
     return tc.Recording(captures, optics), truth
-
-
-def score(image, truth):
-    """PSNR of the part with light."""
-    rows, columns = (np.flatnonzero(truth.any(axis=k)) for k in (1, 0))
-    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    image, truth = np.asarray(image).reshape(truth.shape)[part], truth[part]
-    return float(psnr(align(image, truth)[0], truth))
 
 
 @pytest.mark.parametrize("name", CAMERAS)

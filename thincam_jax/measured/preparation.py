@@ -157,7 +157,7 @@ def prepare(
 
 
 def _found(planes, backgrounds: dict[str, Background], raws, options: Preparation) -> Found:
-    """Levels of the images whose background is to be found, with a warning of what is not sure."""
+    """Background levels of the images that come without one; warns where no corner is dark."""
     sought = [name for name, one in backgrounds.items() if isinstance(one, str) and one == "found"]
     if not sought:
         side = slice(*options.corner)

@@ -115,6 +115,19 @@ class _Tried:
     image: Image
 
 
+def searched(
+    recording: Recording, search: float | int, most: float
+) -> tuple[tuple[int, int], float]:
+    """Shape of the captures and how far to search. **Errors**: ValueError, too small or wide."""
+    rows, columns = recording.captures[0].shape[-2:]
+    if min(rows, columns) < 32:
+        raise ValueError(f"captures have {(rows, columns)} pixels; give at least 32 a side")
+    search = float(checks.positive("search", search, "parts of one"))
+    if search > most:
+        raise ValueError(f"search = {search:g} is too wide; give at most {most:g}")
+    return (rows, columns), search
+
+
 @checked
 def check_psf(
     recording: Recording,
@@ -178,12 +191,7 @@ def check_psf(
         raise ValueError("a check takes measured PSFs of one plane; give a recording with tc.Psfs")
     if checks.is_traced(recording.captures[0]):
         raise TypeError("check_psf searches: call it outside jit and grad")
-    shape = recording.captures[0].shape[-2:]
-    if min(shape) < 32:
-        raise ValueError(f"captures have {shape} pixels; give at least 32 a side")
-    search = float(checks.positive("search", search, "parts of one"))
-    if search > 0.5:
-        raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
+    shape, search = searched(recording, search, 0.5)
     given = np.asarray(recording.imaging_model.psfs)
     try_psf = _Scenes(recording, float(tau))
     pixel = 2 / max(shape)

@@ -18,7 +18,7 @@ from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import residuals
-from thincam_jax.reconstruction.psf_check import Trials, resampled
+from thincam_jax.reconstruction.psf_check import Trials, resampled, searched
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.solver import first_image
@@ -171,12 +171,7 @@ def refine(
         raise ValueError("operators have no numbers to refine; give a recording with tc.Psfs")
     if any(map(checks.is_traced, jax.tree.leaves(recording))):
         raise TypeError("refine searches: call it outside jit and grad")
-    shape = recording.captures[0].shape[-2:]
-    if min(shape) < 32:
-        raise ValueError(f"captures have {shape} pixels; give at least 32 a side")
-    search = float(checks.positive("search", search, "parts of one"))
-    if search > 0.2:
-        raise ValueError(f"search = {search:g} is too wide; give at most 0.2")
+    shape, search = searched(recording, search, 0.2)
     possible = _OF_PSFS if isinstance(model, Psfs) else _OF_CAMERAS
     names = possible if parameters is None else tuple(parameters)
     if not names or not set(names) <= set(possible):

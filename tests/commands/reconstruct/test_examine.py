@@ -68,7 +68,7 @@ def test_swapped_files(paths, tmp_path):
 
 
 def test_bits_that_nobody_told(paths, tmp_path):
-    """Saturated pixels are left out as with --bits; a hot pixel of the PSF is told once."""
+    """Saturated pixels are left out as with --bits; a hot pixel of the PSF is reported once."""
     raw = simulated.tifffile.imread(paths["capture"])
     raw = np.minimum(raw, 2000)
     captures = tmp_path / "captures"
