@@ -22,7 +22,6 @@ import numpy as np
 from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 
 from thincam_jax import learn
-from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.learn.denoiser import drawn
 from thincam_jax.learn.refocusing import photographs
@@ -46,6 +45,12 @@ if SIZE == "full":
     tuning = photographs(PHOTOGRAPHS / "cc0", 384).images[:24:4]
 else:
     unseen, tuning = (drawn(seed, 4).tiles[1:3, :48, :56, 0] for seed in (5, 6))
+
+
+def encoded(linear):
+    """SRGB values of linear light (IEC 61966-2-1)."""
+    power = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, power).astype(np.float32)
 
 
 def noisy(images, sigma):
@@ -184,7 +189,7 @@ for ax, (name, picture) in zip(axes, shown.items(), strict=True):
     quality = (
         "" if picture is image else f", {psnr(picture.astype(float), image.astype(float)):.1f} dB"
     )
-    ax.imshow(encode_srgb(np.clip(picture, 0, 1))[middle], cmap="gray", vmin=0, vmax=1)
+    ax.imshow(encoded(np.clip(picture, 0, 1))[middle], cmap="gray", vmin=0, vmax=1)
     ax.set_title(name + quality, fontsize=10)
     ax.set_axis_off()
 figure.savefig(FIGURES / "crops.png", dpi=110)
