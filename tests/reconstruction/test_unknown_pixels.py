@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 
 import thincam_jax as tc
 from thincam_jax._core import checks
@@ -102,3 +103,28 @@ def test_checked_functions_convert_them_too():
 def test_traced_captures_pass():
     residual = jax.jit(lambda c: tc.Recording(c, PSFS, noise_variance=1.0).captures[0].sum())
     assert float(residual(jnp.asarray(CAPTURES))) == pytest.approx(CAPTURES[0].sum(), rel=1e-5)
+
+
+def test_saturated_and_hot_pixels_are_found_by_default(caplog):
+    """As with the right mask; a mask that is given is not doubted."""
+    generator = np.random.default_rng(3)
+    scene = np.kron(generator.random((1, 8, 11)), np.ones((5, 5)))
+    psf = np.kron(generator.random((1, 5, 5)) < 0.4, np.ones((3, 3)))
+    clean = np.stack([scipy.signal.fftconvolve(scene[0], psf[0], "same")] * 2)
+    clean = clean + 0.003 * clean.max() * generator.standard_normal(clean.shape)
+    limit = np.quantile(clean, 0.9)
+    hot = np.zeros(clean.shape[1:], bool)
+    hot[[9, 20, 31], [12, 40, 25]] = True
+    dirty = np.minimum(clean, limit) + np.where(hot, 2 * limit, 0)
+    psfs = tc.Psfs(np.broadcast_to(psf, (2, 15, 15)))
+    saturated = (clean >= limit) & ~hot
+    found = tc.Recording(dirty, psfs)
+    assert found.valid is not None
+    np.testing.assert_array_equal(np.stack(found.valid), ~(hot | saturated))
+    assert "6 pixels are hot or dead" in caplog.text
+    assert f"{saturated.sum()} pixels are saturated" in caplog.text
+    caplog.clear()
+    assert tc.Recording(clean, psfs).valid is None
+    given = tc.Recording(dirty, psfs, valid=~hot)
+    np.testing.assert_array_equal(np.stack(given.valid or ()), [~hot] * 2)
+    assert not caplog.records

@@ -6,22 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_mean, central_blocks
+from thincam_jax.imaging.defects import RING, defects, fine_noise, plateau
 from thincam_jax.measured.options import Preparation
 from thincam_jax.measured.raw import Raw
 
-_FEW = 20  # pixels at one value that a clean image may have
-_STEEP = 3.0  # times as many pixels as at each of the values below
-_ISOLATED = 3.0  # times the range of the neighbours, by which a defective pixel exceeds them
-_CERTAIN = 8.0  # standard deviations of the noise, or counts
-_SPREAD = 0.1  # share of a point of light that its neighbours have at least
 _DIM, _SATURATED, _BORDER, _COLOURED = 2.0, 5.0, 10.0, 3.0  # %
 _TILES, _COARSE = 8, 64
-_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
-_OUTER = np.flatnonzero(np.pad(np.zeros((3, 3)), 1, constant_values=1))  # of 5×5 pixels
 # Unit and consequence, and what mends it.
 _TEXTS = {
     "plateau": "% of the pixels have the largest value, {}, and are not used; give {} to say so",
@@ -107,66 +101,19 @@ def examine(
     return Examination(tuple(findings), tuple(images[:count]), images[-1] if is_measured else psf)
 
 
-def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
-    """Count the pixels at the largest value where more than noise puts there, else 0."""
-    below = pixels[pixels < pixels.max()]
-    count = pixels.size - below.size
-    if count < _FEW or below.size < _FEW:
-        return 0
-    kept = min(below.size, below.size // 8 + 1000)
-    _, counts = np.unique(np.partition(below, -kept)[-kept:], return_counts=True)
-    return count if counts.size >= 16 and count > _STEEP * counts[-8:].max() else 0
-
-
 def defective_pixels(raw: Raw, is_mosaic: bool = False) -> Bool[np.ndarray, "y x"]:
     """Map of single pixels that differ from all neighbours of their colour as no light does."""
     found = np.zeros(raw.pixels.shape[:2], bool)
     for part in _phases(is_mosaic):
         planes = np.atleast_3d(raw.pixels[part]).astype(np.float32)
         for plane in np.moveaxis(planes, -1, 0):
-            found[part] |= _defective(plane, float(raw.pixels.dtype.kind == "u"))
+            found[part] |= defects(plane, float(raw.pixels.dtype.kind == "u"))
     return found if raw.dead is None else found & ~raw.dead
-
-
-def _defective(plane: np.ndarray, step: float) -> np.ndarray:
-    """`defective_pixels` of one colour; `step`: of its values."""
-    if min(plane.shape) < 8:
-        return np.zeros(plane.shape, bool)
-    high = scipy.ndimage.maximum_filter(plane, footprint=_RING, mode="mirror")
-    low = scipy.ndimage.minimum_filter(plane, footprint=_RING, mode="mirror")
-    beyond = np.maximum(plane - high, low - plane)
-    middle, top = np.percentile(plane, [50, 99.5])
-    floor = max(_CERTAIN * max(_noise(plane), step), 0.01 * (top - middle))
-    odd = beyond > np.maximum(_ISOLATED * (high - low), floor)
-    rows, columns = np.nonzero(odd)
-    if not 0 < rows.size <= max(_FEW, odd.size // 100):
-        return np.zeros_like(odd)
-    # Light of a point reaches the neighbours; a defect does not raise them above what is around.
-    padded = np.pad(plane, 2, mode="reflect")
-    squares = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))[rows, columns]
-    cross = squares[:, [1, 2, 2, 3], [2, 1, 3, 2]].mean(axis=1)
-    outer = np.median(squares.reshape(-1, 25)[:, _OUTER], axis=1)
-    sign = np.sign(plane[rows, columns] - cross)
-    odd[rows, columns] = sign * (cross - outer) <= _SPREAD * beyond[rows, columns]
-    # A mask as fine as a pixel, or points that are all the light there is, are no defects.
-    around = scipy.ndimage.binary_dilation(odd, np.ones((5, 5), bool))
-    base = scipy.ndimage.minimum_filter(plane, 5, mode="mirror")
-    mean = (9 * scipy.ndimage.uniform_filter(plane, 3, mode="mirror") - plane) / 8
-    sharp = (plane - base > floor) & (mean - base < 0.25 * (plane - base)) & ~around
-    light = np.maximum(np.abs(plane - middle) - floor / 2, 0)
-    is_structure = 2 * sharp.sum() > odd.sum() or light[odd].sum() > 0.3 * light.sum()
-    return odd & ~is_structure
-
-
-def _noise(plane: np.ndarray) -> float:
-    """Standard deviation of noise, by the median of second differences along rows."""
-    bend = plane[:, 1:-1] - (plane[:, 2:] + plane[:, :-2]) / 2
-    return 1.21 * float(np.median(np.abs(bend)))
 
 
 def _filled(raw: Raw, odd: np.ndarray, is_mosaic: bool) -> Raw:
     pixels = raw.pixels.copy()
-    ring = _RING if raw.pixels.ndim == 2 else _RING[..., None]
+    ring = RING if raw.pixels.ndim == 2 else RING[..., None]
     for part in _phases(is_mosaic):
         around = scipy.ndimage.median_filter(raw.pixels[part], footprint=ring, mode="mirror")
         pixels[part][odd[part]] = around[odd[part]]
@@ -243,7 +190,7 @@ def _border(image: np.ndarray) -> float:
     strips = [blurred(image[[0, -1]], size, axis=1), blurred(image[:, [0, -1]], size, axis=0)]
     first, last = np.percentile(np.concatenate([one.ravel() for one in strips]), [10, 90])
     low, high = np.percentile(image, [5, 99.9])
-    return 100 * (last - first - 6 * _noise(image) / size**0.5) / max(high - low, 1e-30)
+    return 100 * (last - first - 6 * fine_noise(image) / size**0.5) / max(high - low, 1e-30)
 
 
 def _unexplained(psf: Raw, capture: Raw) -> float:

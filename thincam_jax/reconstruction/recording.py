@@ -42,7 +42,7 @@ from thincam_jax.reconstruction.synthesis import (
     synthesis_matrix,
     with_channel,
 )
-from thincam_jax.reconstruction.unknown_pixels import known_and_valid, without_unknown
+from thincam_jax.reconstruction.unknown_pixels import valid_pixels, without_unknown
 
 # Part of a capture's pixels that may be negative by noise alone.
 _DARKEST = 0.01
@@ -61,7 +61,8 @@ class Recording(Module):
     - `noise_variance`: one number, or one for each capture, in the captures' units squared. By
       default it is estimated by `estimate_variance`, which needs captures that are images.
     - `valid`: mask of the valid pixels, that broadcasts to the captures. Those that are masked
-      (`numpy.ma`) or NaN are not valid either; a warning in the log says how many.
+      (`numpy.ma`) or NaN are not valid either. By default neither are hot and dead pixels, nor
+      those of a plateau at the largest value, which are saturated. A warning says how many.
     - `background`: known light that is not the scene's, such as a black level or a dark frame: one
       for all captures, or one for each, that broadcasts to them. By default it is unknown behind
       `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
@@ -132,8 +133,8 @@ class Recording(Module):
         if noise_variance is not None:
             given_variances(noise_variance, self.captures)  # refuses others
         self.valid = None if valid is None else self._masks(valid)
-        if any(one is not None for one in known):
-            self.valid = known_and_valid(known, self.valid, [c.shape for c in self.captures])
+        is_examined = valid is None and self._axes() == 2
+        self.valid = valid_pixels(self.captures, known, self.valid, is_examined)
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
         if not isinstance(imaging_model, Stacked):  # operators may have masks of their own
@@ -270,9 +271,12 @@ class Recording(Module):
 
     def _has_channel(self) -> bool:
         """Whether the captures have an axis before those of the detector."""
+        return self.captures[0].ndim > self._axes()
+
+    def _axes(self) -> int:
+        """Axes of the detector."""
         model = self.imaging_model
-        axes = len(detector_shape(model.operators[0])) if isinstance(model, Stacked) else 2
-        return self.captures[0].ndim > axes
+        return len(detector_shape(model.operators[0])) if isinstance(model, Stacked) else 2
 
     def _operators(self) -> tuple[AbstractOperator, ...]:
         """Those of a model that is no PSF for the whole field."""
