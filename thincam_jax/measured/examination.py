@@ -14,7 +14,7 @@ from thincam_jax.imaging.defects import RING, defects, fine_noise, plateau
 from thincam_jax.measured.options import Preparation
 from thincam_jax.measured.raw import Raw
 
-_DIM, _SATURATED, _BORDER, _COLOURED = 2.0, 5.0, 10.0, 3.0  # %
+_DIM, _LIT, _SATURATED, _BORDER, _COLOURED = 2.0, 25.0, 5.0, 10.0, 3.0  # %
 _TILES, _COARSE = 8, 64
 # Unit and consequence, and what mends it.
 _TEXTS = {
@@ -29,6 +29,7 @@ _TEXTS = {
     "cut": "% of its peak varies along its border: what is beyond is missing; compute it: --camera",
     "swapped": "% is not explained by the PSF, which it explains; exchange --psf and --capture",
     "unexplained": "% of its variation is neither image nor noise; try thincam calibrate check",
+    "misfit": "times the noise is left; {}",
     "noise": "counts of noise are found, and {} are given; leave --noise out if that is unsure",
 }
 
@@ -151,7 +152,7 @@ def _examined(raw: Raw, where: str, options: Preparation, found: list[Finding]) 
         found.append(finding("overexposed", where, share, share > 50))
     low, high = np.percentile(raw.pixels, [1, 99.9])
     bright = 100 * (high - (low if raw.black_level is None else raw.black_level)) / full
-    if raw.bits is not None and bright < _DIM:
+    if raw.bits is not None and bright < _DIM and not count and 100 * high < _LIT * full:
         found.append(finding("underexposed", where, bright))
     difference, error, pattern = _phase_difference(image)
     if raw.channels == 1 and pattern and not is_mosaic:

@@ -20,6 +20,7 @@ from thincam_jax.reconstruction.coarse import coarser, finer
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
+from thincam_jax.reconstruction.orientation import better_mirrored
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -285,10 +286,13 @@ class AdmmTV(AbstractRegularised):
         if given:
             return self._by_admm(problem, image, callback)
         outcome = self._by_levels(problem, image, callback, _COARSER)
-        if outcome.status != "converged":  # what is left is not yet misfit
-            return outcome
-        misfit = misfit_of(problem, outcome.image)
+        is_done = outcome.status in ("converged", "iterations_exhausted")
+        misfit = misfit_of(problem, outcome.image) if is_done else None
         if misfit is None:
+            return outcome
+        if misfit.is_suspect and (better := better_mirrored(problem, image, self._lowest)):
+            return dataclasses.replace(outcome, reason=better)
+        if outcome.status != "converged":  # what is left is not yet misfit
             return outcome
         easier = misfit.less_smooth(problem)
         if easier is not None:
@@ -297,6 +301,11 @@ class AdmmTV(AbstractRegularised):
             seconds = outcome.seconds + again.seconds
             outcome = dataclasses.replace(again, image=image, seconds=seconds)
         return dataclasses.replace(outcome, reason=str(misfit))
+
+    def _lowest(self, problem: InverseProblem, image: Image) -> float:
+        """The lowest objective, roughly."""
+        rough = dataclasses.replace(self, tolerance=max(self.tolerance, _ROUGH))
+        return float(rough._from_nothing(problem, image, None).history[-1].objective)
 
     def _by_levels(self, problem, image, callback, levels: int) -> Outcome:
         """On pixels up to `levels` times halved; the last begins as `_from_nothing` does."""
