@@ -143,6 +143,10 @@ def cut(psf):
     return psf[first[0] : first[0] + SHAPE[0], first[1] : first[1] + SHAPE[1]]
 
 
+def _edges(image):
+    return image[[0, -1]], image[:, [0, -1]]
+
+
 def command(folder, psf, capture, *options):
     """Score-able image and what was said, of `thincam reconstruct`."""
     out = folder / "image.npy"
@@ -181,7 +185,9 @@ def by_files(folder: Path, number):
     clean = [] if faults else [*known, "--background", level]
     made, said = command(folder, paths["psf"], paths["capture"], *clean)
     others = [command(folder, upright, paths["capture"], *options)[0] for options in grid]
-    truth = image.mean(axis=0)
+    truth, border = image.mean(axis=0), np.concatenate([p.ravel() for p in _edges(cut(psf))])
+    if np.ptp(border) > 0.1 * psf.max():  # it is cut, so that to say so is right
+        said = [one for one in said if one != "cut"] + ["(cut)"] * ("cut" in said)
 
     def quality(found):
         if found is None:
@@ -233,13 +239,13 @@ def test_dirty_captures(tmp_path, capsys, caplog):
         with capsys.disabled():
             print(f"{row}| {'; '.join(said)} |", flush=True)
         clean += not faults
-        alarms += [number] * bool(said and not faults)
+        alarms += [number] * bool(set(said) - {"(cut)"} and not faults)
         if faults:
             lost.append(best - made)
-            silent += [(number, best - made)] * (not said and best - made > 1)
+            silent += [(number, best - made)] * (not set(said) - {"(cut)"} and best - made > 1)
     lost = np.array(lost)
     with capsys.disabled():
         print(f"{lost.size} dirty: {(lost <= 1).mean():.0%} within 1 dB, {np.median(lost):.2f} dB")
         print(f"silent beyond 1 dB: {silent}; alarms on {clean} clean: {alarms}")
     assert all(difference <= 3 for _, difference in silent)
-    assert len(alarms) <= 0.02 * clean + 1
+    assert len(alarms) <= 0.02 * clean

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
+import thincam_jax as tc
 from helpers import count_traces
+from thincam_jax.imaging.operators import Separable
 from thincam_jax.reconstruction.noise import estimate_noise, estimate_variance
 
 compiled = jax.jit(estimate_noise)
@@ -134,3 +136,21 @@ def test_the_variance_of_each_capture():
     scaled = estimate_variance(jnp.asarray(captures * 1e-9))
     np.testing.assert_allclose(scaled, 1e-18 * value, rtol=1e-9)
     np.testing.assert_array_equal(estimate_variance(jnp.zeros((2, 4, 5))), 1.0)
+
+
+@pytest.mark.parametrize("terms", [1, 2])
+def test_noise_of_codes_as_fine_as_a_pixel(terms):
+    """By what no image casts; the finest detail is that of the code."""
+    generator = np.random.default_rng(4)
+    left, right = (generator.random((terms, n, 12)) < 0.5 for n in (40, 51))
+    operator = Separable(left.astype(float), right.astype(float))
+    clean = np.asarray(operator(jnp.asarray(generator.random((2, 12, 12)))))
+    sigma = 1e-3 * clean.max()
+    capture = clean + sigma * generator.standard_normal(clean.shape)
+    by_detail = float(np.sqrt(estimate_variance([jnp.asarray(capture)])[0]))
+    assert by_detail > 5 * sigma
+    found = 1 / np.sqrt(tc.Recording([capture], operator).problem().weights[0])
+    assert float(np.ravel(found)[0]) == pytest.approx(sigma, rel=0.05)
+    wide = Separable(np.eye(9, 40), np.eye(9, 51))  # nothing is left over
+    (weight,) = tc.Recording([capture[0, :9, :9]], wide).problem().weights
+    assert np.all(np.isfinite(weight)) and np.all(weight > 0)

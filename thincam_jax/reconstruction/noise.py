@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.precision import product
+from thincam_jax.imaging.operators import AbstractOperator, Separable
 
 # Classes of brightness of a photon-transfer curve, and the least details of one.
 _CLASSES, _LEAST = 32, 64
@@ -186,6 +188,35 @@ def _variances(deviations, captures):
     found = jnp.stack([jnp.mean(d**2) for d in deviations])
     least = 1e-6 * jnp.mean(jnp.stack([jnp.mean(c**2) for c in captures]))
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))
+
+
+def unseen_variance(
+    operators: Sequence[AbstractOperator],
+    captures: Sequence[Float[Array, "*batch y x"]],
+    found: Float[Array, " capture"],
+) -> Float[Array, " capture"]:
+    """The lower of a variance `found` and that of what no image casts through a separable camera.
+
+    Both are too high at worst: that of the finest detail where the code is as fine as a pixel, that
+    of (1 − P) G, with P onto the columns of the two matrices, by light that the model lacks.
+    """
+    least = list(found)
+    for n, operator in enumerate(operators):
+        if isinstance(operator, Separable):
+            unseen = _unseen(operator.left, operator.right, captures[n])
+            least[n] = jnp.where(unseen > 0, jnp.minimum(found[n], unseen), found[n])
+    return jnp.stack(least)
+
+
+@jax.jit
+def _unseen(left: Float[Array, "k y m"], right: Float[Array, "k x n"], capture):
+    """Variance of a capture outside of the columns of two matrices; 0 where too little is."""
+    bases = [jnp.linalg.qr(jnp.concatenate(list(one), axis=1))[0] for one in (left, right)]
+    rows, columns = (product(basis, basis.T) for basis in bases)
+    lost = capture - product(product(rows, capture), columns)
+    freedom = math.prod(capture.shape[-2:]) - math.prod(basis.shape[1] for basis in bases)
+    count = freedom * capture.size / math.prod(capture.shape[-2:])
+    return jnp.sum(lost**2) / count if freedom >= _LEAST else jnp.zeros((), capture.dtype)
 
 
 def given_variances(

@@ -30,7 +30,7 @@ from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome
-from thincam_jax.reconstruction.noise import estimate_variance, given_variances
+from thincam_jax.reconstruction.noise import estimate_variance, given_variances, unseen_variance
 from thincam_jax.reconstruction.planes import warn_of_equal_planes
 from thincam_jax.reconstruction.problem import Background, InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
@@ -364,7 +364,8 @@ class Recording(Module):
         model = self.imaging_model
         if isinstance(model, Stacked) and any(len(s) < 2 for s in shapes_of(model.out_shape)):
             raise ValueError("give noise_variance: it is estimated from captures that are images")
-        return estimate_variance(captures, None if valid[0] is None else valid)
+        found = estimate_variance(captures, None if valid[0] is None else valid)
+        return unseen_variance(self._operators(), captures, found) if valid[0] is None else found
 
     def _pitch(self, dtype) -> Float[Array, ""]:
         if isinstance(self.imaging_model, Cameras):

@@ -41,12 +41,12 @@ def valid_pixels(
     ]
     _exclude(masks, good, "masked or NaN")
     if is_examined and not checks.holds_traced(captures):
-        images = [np.asarray(capture, np.float32) for capture in captures]
-        odd = [_each(image, defects) for image in images]
+        images = [np.asarray(capture) for capture in captures]
+        odd = [_each(image.astype(np.float32), defects) for image in images]
         alike = [[other for other in odd if other.shape == one.shape] for one in odd]
         odd = [one & (2 * np.sum(s, axis=0) > len(s)) for one, s in zip(odd, alike, strict=True)]
         _exclude(masks, [~one for one in odd], "hot or dead")
-        dim = [np.where(o, c.min(), c) for c, o in zip(captures, odd, strict=True)]
+        dim = [np.where(o, c.min(), c) for c, o in zip(images, odd, strict=True)]
         full = [_each(image, _saturated) for image in dim]
         _exclude(masks, [~one for one in full], "saturated, at one largest value")
     if all(mask is np.True_ for mask in masks):
