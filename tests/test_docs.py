@@ -227,9 +227,16 @@ def test_pages_begin_with_a_picture():
         assert "![" in re.split(r"^##", text, maxsplit=1, flags=re.MULTILINE)[0], page
 
 
+def notes() -> dict[str, str]:
+    """What was measured and decided, by the path below docs/."""
+    folder = ROOT / "docs"
+    paths = [path for place in ("measured", "decisions") for path in (folder / place).glob("*.md")]
+    return {path.relative_to(folder).as_posix(): path.read_text("utf-8") for path in paths}
+
+
 def test_links_between_pages_lead_somewhere():
     """To files that are there; the scripts' pages and the reference are made with the site."""
-    for page, text in pages().items():
+    for page, text in (pages() | notes()).items():
         for target in re.findall(r"\]\(([\w./-]+\.(?:md|rst|png))", text):
             name = os.path.normpath(PurePosixPath(page).parent / target)
             made = name in ("gallery/index.rst", "api/index.md")
@@ -244,7 +251,11 @@ TESTED += ("guide/screen_calibration",)
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     "page",
-    [page for page, text in pages().items() if "```python\n" in text and page[:-3] not in TESTED],
+    [
+        page
+        for page, text in (pages() | notes()).items()
+        if "```python\n" in text and page[:-3] not in TESTED
+    ],
 )
 def test_examples_of_the_other_pages_run(page, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
