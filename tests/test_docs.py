@@ -244,6 +244,27 @@ def test_links_between_pages_lead_somewhere():
             assert made or (ROOT / "docs" / name).exists() or script.exists(), (page, target)
 
 
+def test_links_to_headings_find_them():
+    """By the site's rule for anchors: lower case, hyphens for spaces, no other punctuation."""
+    every = pages() | notes()
+    anchors = {
+        page: {
+            re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+            for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+        }
+        for page, text in every.items()
+    }
+    missing = [
+        (page, target, anchor)
+        for page, text in every.items()
+        for target, anchor in re.findall(r"\]\(([\w./-]*)#([\w-]+)\)", text)
+        if not target.startswith("http")
+        if anchor
+        not in anchors[os.path.normpath(PurePosixPath(page).parent / target) if target else page]
+    ]
+    assert not missing
+
+
 TESTED = ("start", "guide/accuracy", "guide/real_captures", "guide/flatcam", "guide/screen")
 TESTED += ("guide/screen_calibration",)
 
@@ -349,6 +370,9 @@ FITS = {
     "optics": "rig_colour",
     "methods": "fza_harmonics",
     "models": "stis",
+    "search": "design_pitches",
+    "train": "design_distances",
+    "pareto": "design_pareto",
     "guide/stis.md: mask": "stis",
 }
 
