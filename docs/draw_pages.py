@@ -228,8 +228,8 @@ def masks():
 
 
 def photon_transfer():
-    """A frame of an evenly lit sensor, corrected, and the line: the example of the rig's page."""
-    page = (ROOT / "docs/guide/rig.md").read_text("utf-8")
+    """A frame of an evenly lit sensor, corrected, and the line: the example of its page."""
+    page = (ROOT / "docs/measured/photon_transfer.md").read_text("utf-8")
     names: dict = {}
     os.chdir(tempfile.mkdtemp())
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):

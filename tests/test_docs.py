@@ -227,14 +227,42 @@ def test_pages_begin_with_a_picture():
         assert "![" in re.split(r"^##", text, maxsplit=1, flags=re.MULTILINE)[0], page
 
 
+def notes() -> dict[str, str]:
+    """What was measured and decided, by the path below docs/."""
+    folder = ROOT / "docs"
+    paths = [path for place in ("measured", "decisions") for path in (folder / place).glob("*.md")]
+    return {path.relative_to(folder).as_posix(): path.read_text("utf-8") for path in paths}
+
+
 def test_links_between_pages_lead_somewhere():
     """To files that are there; the scripts' pages and the reference are made with the site."""
-    for page, text in pages().items():
+    for page, text in (pages() | notes()).items():
         for target in re.findall(r"\]\(([\w./-]+\.(?:md|rst|png))", text):
             name = os.path.normpath(PurePosixPath(page).parent / target)
             made = name in ("gallery/index.rst", "api/index.md")
             script = ROOT / "experiments" / f"{PurePosixPath(name).stem}.py"
             assert made or (ROOT / "docs" / name).exists() or script.exists(), (page, target)
+
+
+def test_links_to_headings_find_them():
+    """By the site's rule for anchors: lower case, hyphens for spaces, no other punctuation."""
+    every = pages() | notes()
+    anchors = {
+        page: {
+            re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+            for heading in re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+        }
+        for page, text in every.items()
+    }
+    missing = [
+        (page, target, anchor)
+        for page, text in every.items()
+        for target, anchor in re.findall(r"\]\(([\w./-]*)#([\w-]+)\)", text)
+        if not target.startswith("http")
+        if anchor
+        not in anchors[os.path.normpath(PurePosixPath(page).parent / target) if target else page]
+    ]
+    assert not missing
 
 
 TESTED = ("start", "guide/accuracy", "guide/real_captures", "guide/flatcam", "guide/screen")
@@ -244,7 +272,11 @@ TESTED += ("guide/screen_calibration",)
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     "page",
-    [page for page, text in pages().items() if "```python\n" in text and page[:-3] not in TESTED],
+    [
+        page
+        for page, text in (pages() | notes()).items()
+        if "```python\n" in text and page[:-3] not in TESTED
+    ],
 )
 def test_examples_of_the_other_pages_run(page, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
@@ -272,7 +304,7 @@ def test_learned_thesis_page(monkeypatch):
     """What the page says of the optics of both cameras; at small size, too, the thesis' planes are
     not told apart, and those here are."""
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    page = (ROOT / "docs/guide/refocusing.md").read_text("utf-8")
+    page = (ROOT / "docs/measured/refocusing_thesis.md").read_text("utf-8")
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
         script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
         thesis, optics = script["thesis_camera"], script["optics"]
@@ -338,6 +370,9 @@ FITS = {
     "optics": "rig_colour",
     "methods": "fza_harmonics",
     "models": "stis",
+    "search": "design_pitches",
+    "train": "design_distances",
+    "pareto": "design_pareto",
     "guide/stis.md: mask": "stis",
 }
 
