@@ -93,7 +93,7 @@ def test_what_has_no_terms_is_refused():
     ("distance", "missed"), [(0.5, (11.5, 3.9, 0.5)), (2.0, (28.5, 19.8, 2.4))]
 )
 def test_how_many_products_a_coded_mask_needs(distance, missed):
-    """The table of docs/guide/flatcam.md, per cent, by singular values of the centred PSF."""
+    """The table of docs/measured/flatcam.md, per cent, by singular values of the centred PSF."""
     code = tc.maximum_length_sequence(255)
     mask = tc.SeparableMask(code, code, cell=30 * um, combine="xor")
     flat = tc.LenslessCamera(mask, tc.Sensor((1020, 1020), 7.5 * um), distance)

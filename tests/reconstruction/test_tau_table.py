@@ -1,6 +1,6 @@
 """The default τ and those found by a rule, against the best, on captures like real ones.
 
-The test in full prints the table of docs/guide/reconstruct.md (`-s -m full_size`).
+The test in full prints the table of docs/measured/solvers.md (`-s -m full_size`).
 """
 
 import functools

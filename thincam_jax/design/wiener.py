@@ -14,11 +14,11 @@ own power |G_c|²/Ω_c. As there, the filter takes captures as if nothing had be
 that costs is in the error. H_c is even, so that all of it is done in real numbers for the even and
 odd parts of the images (`thincam_jax.design.cosine_transforms`).
 
-It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures, estimates
-the mean, and finds the strength on its own window. In the thesis' camera the gain of one pair of
-distances over another agrees within 0.3 dB (docs/guide/design.md); on a few dozen pixels, where few
-frequencies tell the strength, errors differ by up to 1.5 dB. Where designs rank near to each other,
-the full simulation decides.
+It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures, estimates the
+mean, and finds the strength on its own window. In the thesis' camera the gain of one pair of
+distances over another agrees within 0.3 dB (docs/measured/designs.md); on a few dozen pixels, where
+few frequencies tell the strength, errors differ by up to 1.5 dB. Where designs rank near to each
+other, the full simulation decides.
 """
 
 import equinox as eqx

@@ -2,7 +2,7 @@
 
 Between two chunks of iterations a run can report, stop early, adapt and be interrupted. Chunks are
 unrolled: on a CPU, XLA runs the transforms of a compiled loop on one core and those of a straight
-program on all (docs/guide/reconstruct.md has the comparison).
+program on all (docs/measured/solvers.md has the comparison).
 """
 
 import abc

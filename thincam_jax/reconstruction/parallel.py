@@ -2,7 +2,7 @@
 
 The images of a batch share only the operator, and so do colours without coupled variation. On a CPU
 a single element stays in the cache, and cores that it leaves idle between its transforms serve
-another (docs/guide/reconstruct.md has the comparison). Each element has its own units and
+another (docs/measured/solvers.md has the comparison). Each element has its own units and
 penalties.
 """
 
