@@ -3,6 +3,7 @@
 from thincam_jax.measured.bayer import demosaic as demosaic
 from thincam_jax.measured.bayer import demosaic_mask as demosaic_mask
 from thincam_jax.measured.containers import unpack_raw as unpack_raw
+from thincam_jax.measured.examination import examine as examine
 from thincam_jax.measured.exposures import ExposedFrames as ExposedFrames
 from thincam_jax.measured.exposures import MergedExposures as MergedExposures
 from thincam_jax.measured.exposures import merge_exposures as merge_exposures

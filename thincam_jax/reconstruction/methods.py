@@ -20,7 +20,7 @@ from thincam_jax.reconstruction.coarse import coarser, finer
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
-from thincam_jax.reconstruction.orientation import better_mirrored
+from thincam_jax.reconstruction.other_psf import better_psf
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -290,8 +290,10 @@ class AdmmTV(AbstractRegularised):
         misfit = misfit_of(problem, outcome.image) if is_done else None
         if misfit is None:
             return outcome
-        if misfit.is_suspect and (better := better_mirrored(problem, image, self._lowest)):
-            return dataclasses.replace(outcome, reason=better)
+        if misfit.is_suspect:
+            better = better_psf(problem, image, self._lowest, not misfit.is_smooth)
+            if better:
+                return dataclasses.replace(outcome, reason=better)
         if outcome.status != "converged":  # what is left is not yet misfit
             return outcome
         easier = misfit.less_smooth(problem)

@@ -202,7 +202,7 @@ def check_psf(
 
     def tried(turned, scale: float) -> _Tried:
         nonlocal done
-        found = try_psf(_scaled(turned, scale))
+        found = try_psf(scaled_psf(turned, scale))
         done += 1
         if callback is not None:
             callback(done, todo)
@@ -217,7 +217,7 @@ def check_psf(
     for scale in (lowest - pixel / 2, lowest + pixel / 2):
         profile[scale] = tried(turned[best], scale)
     lowest = min(profile, key=lambda s: profile[s].objective)
-    around = [_scaled(turned[best], lowest + k * pixel / 2) for k in (-1, 0, 1)]
+    around = [scaled_psf(turned[best], lowest + k * pixel / 2) for k in (-1, 0, 1)]
     slopes = try_psf.slopes(profile[lowest].image, around, pixel)
     change = np.linalg.norm(around[2] - around[0]) / pixel
     least = _LEAST_ERROR * float(np.linalg.norm(around[1]) / change) if change > 0 else np.inf
@@ -341,7 +341,9 @@ def _oriented(psf: np.ndarray, number: int) -> np.ndarray:
     return turned
 
 
-def _scaled(psf: np.ndarray, scale: float) -> Float[np.ndarray, "capture channel plane k l"]:
+def scaled_psf(
+    psf: Float[np.ndarray, "*batch k l"], scale: float
+) -> Float[np.ndarray, "*batch k l"]:
     """The PSF enlarged about its centre, by cubic splines, with its sum and nearly its sharpness.
 
     A sharper PSF needs less detail in the image, and so explains a capture at a lower cost, right

@@ -23,7 +23,7 @@ from thincam_jax.measured.examination import Examination, Finding, examine, find
 from thincam_jax.measured.write import LINEAR, linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver, refine
 from thincam_jax.reconstruction.depth import depth_of_colours
-from thincam_jax.reconstruction.orientation import ADVICE
+from thincam_jax.reconstruction.other_psf import RESIZE, TURN
 from thincam_jax.reconstruction.psf_check import blocks_blur
 from thincam_jax.reconstruction.refinement import changed_psf
 from thincam_jax.studies.prepared import (
@@ -278,7 +278,7 @@ def _doubts(job: Job, ready: measured.Prepared, done: PreparedResult) -> Iterato
     left = done.relative_residual * float(np.sqrt(np.mean(light**2))) / varies
     if why := done.found.reason:
         over = left * varies / done.pixel_deviation
-        yield finding("misfit", where, over, why.endswith(ADVICE), why)
+        yield finding("misfit", where, over, why.endswith((TURN, RESIZE)), why)
     if left > max(_SUSPECT, 3 * done.pixel_deviation / varies):
         yield finding("unexplained", where, 100 * left, True)
     given, found = done.noise.counts, pixel_noise(ready).counts

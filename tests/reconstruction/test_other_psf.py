@@ -1,5 +1,6 @@
-"""PSFs that are upside down are found from the captures, and the advice mends the image."""
+"""PSFs upside down or too large are found from the captures; the advice mends the image."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,8 +10,7 @@ import scipy.signal
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.reconstruction import InverseProblem
-from thincam_jax.reconstruction.orientation import _mirrored
+from thincam_jax.reconstruction.other_psf import _mirror
 
 RNG = np.random.default_rng(5)
 SHAPE = (52, 61)
@@ -33,13 +33,13 @@ def test_spectra_are_those_of_mirrored_kernels(axes):
     """Exactly so where sensor and field agree in parity, else half a pixel away."""
     kernel, image = RNG.random((1, 1, 5, 7)), jnp.asarray(RNG.random((1, 1, 8, 13)))
 
-    def problem(kernel):
-        operator = CropConvolution(jnp.asarray(kernel), 1.0, (12, 17), (8, 13), summed=1)
-        return InverseProblem([operator], [jnp.zeros((1, 12, 17))], weights=[1.0])
+    def operator(kernel):
+        return CropConvolution(jnp.asarray(kernel), 1.0, (12, 17), (8, 13), summed=1)
 
-    mirrored = _mirrored(problem(kernel), axes).operators[0](image)
-    expected = problem(np.flip(kernel, axes)).operators[0](image)
-    assert relative_l2(mirrored, expected) < 1e-12
+    given = operator(kernel)
+    spectrum = jnp.asarray(_mirror(axes)(np.asarray(given.spectrum), given.window))
+    mirrored = eqx.tree_at(lambda o: o.spectrum, given, spectrum)(image)
+    assert relative_l2(mirrored, operator(np.flip(kernel, axes))(image)) < 1e-12
 
 
 @pytest.mark.parametrize("turn", TURNS)
@@ -52,8 +52,14 @@ def test_what_is_said_mends_the_image(turn):
     assert errors[0] < 0.5 * errors[1]
 
 
+def test_a_psf_of_another_size_is_found():
+    larger = scipy.ndimage.zoom(PSF, 1.06, order=1)
+    found = tc.reconstruct(tc.Recording([CAPTURE], tc.Psfs(larger[None])), SOLVER)
+    assert "has 0.94 times the size; refine it" in found.reason
+
+
 def test_symmetric_and_otherwise_wrong_psfs_are_not_turned():
     other = scipy.ndimage.gaussian_filter(PSF, 1.2)
     for psf in (other, (other + np.flip(other)) / 2, other + other[::-1]):
         found = tc.reconstruct(tc.Recording([CAPTURE], tc.Psfs(psf[None])), SOLVER)
-        assert "turn the PSF" not in found.reason
+        assert "fit far better" not in found.reason
