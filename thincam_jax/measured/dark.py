@@ -32,7 +32,10 @@ def corner_levels(planes: Mapping[str, np.ndarray], square: tuple[Any, ...]) -> 
 
 
 def find_levels(
-    planes: Mapping[str, np.ndarray], corner: tuple[int, int], bayer: Pattern | None
+    planes: Mapping[str, np.ndarray],
+    corner: tuple[int, int],
+    bayer: Pattern | None,
+    comparable: bool = True,
 ) -> Found:
     """Find black levels of a PSF and a capture (channel, y, x), both in parts of one full scale.
 
@@ -42,17 +45,20 @@ def find_levels(
     images, which no black level exceeds, and nothing is subtracted of the capture.
 
     - `corner`: start and stop of a square, from each corner.
+    - `comparable`: whether one bit depth makes the PSF's level tell that of the capture.
     """
     side = corner[1] - corner[0]
     squares = [(slice(None), *square) for square in _corners(planes["psf"].shape, corner)]
     for square in squares:
         found = corner_levels(planes, square)
         if is_dark(planes["psf"], found.levels["psf"], side):
-            if not is_dark(planes["capture"], found.levels["capture"], side):
+            of_capture = planes["capture"], found.levels["capture"], side
+            if not (comparable and is_dark(*of_capture)):
                 found.sources["capture"] = "found with the image"
                 found.levels["capture"] = np.zeros((1, 1, 1), np.float32)
             return found
-    lowest = np.float32(min(_lowest(one, bayer) for one in planes.values())).reshape(1, 1, 1)
+    seen = [one for name, one in planes.items() if comparable or name == "psf"]
+    lowest = np.float32(min(_lowest(one, bayer) for one in seen)).reshape(1, 1, 1)
     levels = {"psf": lowest, "capture": np.zeros_like(lowest)}
     sources = {"psf": "lowest value", "capture": "found with the image"}
     return Found(levels, sources, squares[0])
