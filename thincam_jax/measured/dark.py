@@ -1,7 +1,7 @@
-"""Black levels that nobody gave: dark corners of a PSF, tested, or its lowest value."""
+"""Black levels that nobody gave, of dark corners or the lowest value; hot pixels of dark frames."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,13 @@ import scipy
 
 from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import Pattern
+from thincam_jax.measured.raw import Raw
 
 _LIT = 0.15  # largest part of the mean light that a dark place may hold
+_HOT = 8.0  # standard deviations of a dark frame
+_NEAR = (
+    np.add.outer(np.arange(5) % 2, np.arange(5) % 2) == 0
+)  # pixels of one colour, also of a mosaic
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +81,28 @@ def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
     lowest = means.min(axis=(1, 2), keepdims=True)
     light = means.mean(axis=(1, 2), keepdims=True) - lowest
     return bool((level - lowest <= _LIT * light).all())
+
+
+def without_hot_pixels(raw: Raw, dark: Raw, fill: bool) -> tuple[Raw, Raw]:
+    """An image and its dark frame less the excess of hot pixels, which leaves their difference.
+
+    So an examination finds no defects that the dark frame mends. Hot pixels at the image's largest
+    value are dead, or if `fill` only get the median of their neighbours.
+    """
+    if raw.pixels.shape != dark.pixels.shape or raw.bits != dark.bits:
+        return raw, dark  # refused later
+    near = {"footprint": _NEAR if raw.pixels.ndim == 2 else _NEAR[..., None], "mode": "mirror"}
+    around, counted = scipy.ndimage.median_filter(dark.pixels, **near), raw.pixels.dtype.kind == "u"
+    excess = dark.pixels.astype(float) - around
+    hot = excess > _HOT * max(1.48 * float(np.median(np.abs(excess))), 0.5 * counted)
+    full = hot & (raw.pixels == raw.pixels.max())
+    pixels = np.where(hot, raw.pixels - excess, raw.pixels)
+    pixels = np.where(full, scipy.ndimage.median_filter(pixels, **near), pixels)
+    pixels = np.maximum(np.rint(pixels), 0) if counted else pixels
+    lost = full if full.ndim == 2 else full.any(axis=2)
+    dead = raw.dead if fill or not lost.any() else lost | (False if raw.dead is None else raw.dead)
+    quiet = replace(dark, pixels=np.where(hot, around, dark.pixels))
+    return replace(raw, pixels=pixels.astype(raw.pixels.dtype), dead=dead), quiet
 
 
 def _corners(shape: tuple[int, ...], corner: tuple[int, int]) -> list[tuple[slice, slice]]:

@@ -20,7 +20,6 @@ alone, not from each frame's own counts, which would favour the darker ones.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Real
@@ -116,40 +115,24 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     light = float(np.sum(means[seen] ** 2))
     gain = max(float(np.vdot(means[seen], excess[seen])) / light, 0.0) if light > 0 else 0.0
 
-    rate, variance = weighted_rate(
-        means, seen, times, gain / counts, read * (1 / counts + 1 / darks), counts
+    def along(numbers: np.ndarray) -> np.ndarray:
+        return np.where(seen, numbers[:, None, None], 0.0)
+
+    rough = (along(counts) * means).sum(axis=0) / np.maximum(
+        along(counts * times).sum(axis=0), 1e-300
     )
-    return MergedExposures(rate, variance, gain, tuple(dark_variance.tolist()))
-
-
-def weighted_rate(
-    means: np.ndarray,
-    seen: np.ndarray,
-    times: np.ndarray,
-    gain: Any,
-    read: Any,
-    counts: Any = 1.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rate of `means` (exposure, …) where they are `seen`, and its variance, as of this module.
-
-    - `gain`, `read`: variance of each mean, for a count of light and without light.
-    - `counts`: frames of each mean.
-    """
-
-    def each(numbers: Any) -> np.ndarray:
-        numbers = np.broadcast_to(np.asarray(numbers, float), times.shape)
-        return numbers.reshape(-1, *[1] * (means.ndim - 1))
-
-    frames = seen * each(counts)
-    rough = (frames * means).sum(axis=0) / np.maximum((frames * each(times)).sum(axis=0), 1e-300)
-    weights = seen / (np.maximum(rough, 0.0) * each(gain * times) + each(read))
-    information = (weights * each(times) ** 2).sum(axis=0)
+    expected = gain * np.maximum(rough, 0.0) * times[:, None, None]
+    noise = expected / counts[:, None, None] + (read * (1 / counts + 1 / darks))[:, None, None]
+    weights = seen / noise
+    information = (weights * along(times) ** 2).sum(axis=0)
     valid = information > 0
     shortest = int(np.argmin(times))
     full = means[shortest] / times[shortest]
-    rate = (weights * each(times) * means).sum(axis=0) / np.where(valid, information, 1.0)
+    rate = (weights * along(times) * means).sum(axis=0) / np.where(valid, information, 1.0)
     variance = np.where(valid, 1 / np.where(valid, information, 1.0), np.inf)
-    return np.where(valid, rate, full), variance
+    return MergedExposures(
+        np.where(valid, rate, full), variance, gain, tuple(dark_variance.tolist())
+    )
 
 
 def moments(one: ExposedFrames, full_scale: int, lines: bool = False) -> np.ndarray:

@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -171,6 +171,23 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
             f"{folder}: holds no capture; give a folder of TIFF, PNG, NPY or raw files"
         )
     return sorted(paths, key=_order)
+
+
+def pair_backgrounds(captures: Sequence[Path], folder: Path) -> list[Path]:
+    """List the background of each capture: that of its name, or all of the folder in order.
+
+    **Errors**: CaptureFileError where only some names agree, or none does and the counts differ.
+    """
+    named = {path.stem: path for path in image_files(folder)}
+    common = sum(capture.stem in named for capture in captures)
+    if common == len(captures):
+        return [named[capture.stem] for capture in captures]
+    if common or len(named) != len(captures):
+        raise CaptureFileError(
+            f"{folder}: holds {len(named)} backgrounds for {len(captures)} captures, {common} of "
+            "them named as one; name all as their captures, give as many, or one file for all"
+        )
+    return list(named.values())
 
 
 def _order(path: Path) -> tuple[list[tuple[int, str]], str]:

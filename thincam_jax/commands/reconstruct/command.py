@@ -14,7 +14,11 @@ METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
 
 Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
 Background = Annotated[
-    str | None, Option(help="Dark frame, or a number of counts. Default: a corner of the PSF.")
+    str | None,
+    Option(
+        help="Dark frame, folder of one for each capture, number of counts, or corner of the PSF. "
+        "Default: found."
+    ),
 ]
 PsfBackground = Annotated[
     str | None, Option(help="That of the PSF, where it was exposed otherwise.")
@@ -42,11 +46,20 @@ Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where de
 
 
 def reconstruct(
-    capture: Annotated[Path, Option(help="Capture of the same size; or a folder of captures.")],
+    capture: Annotated[
+        list[Path],
+        Option(help="Capture of the same size; or a folder of captures. Several: exposures of it."),
+    ],
     out: Annotated[
         Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
     ],
-    psf: Annotated[Path | None, Option(help="Measured PSF: TIFF, PNG or NPY.")] = None,
+    psf: Annotated[
+        list[Path] | None, Option(help="Measured PSF: TIFF, PNG or NPY. Several: exposures of it.")
+    ] = None,
+    exposure: Annotated[
+        list[str] | None,
+        Option(help="As 4ms, of each of several exposures, where the files do not say it."),
+    ] = None,
     distances: Annotated[
         str | None,
         Option(help="60mm,80mm,100mm: refocus; --psf is a folder or TIFF of a PSF for each."),
@@ -132,8 +145,8 @@ def reconstruct(
         from thincam_jax.commands.reconstruct.run import run_with_bar
         from thincam_jax.measured import Preparation
 
-        given = psf, camera, set_, network, distance, background
-        known, focusing = options.known_psf(*given)
+        psfs = psf or []
+        known, focusing = options.known_psf(psfs, camera, set_, network, distance)
         sources = Sources(
             known,
             options.read_background(background),
@@ -152,7 +165,8 @@ def reconstruct(
                 psf_channels=psf_channels,
             ),
             psf_bits,
-            options.read_distances(distances, psf),
+            options.read_distances(distances, psfs),
+            options.read_exposures(exposure or (), len(psfs), len(capture)),
         )
         recipe = Recipe(
             method=method.replace("-", "_"),
@@ -168,7 +182,8 @@ def reconstruct(
         )
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
         output = Output(out, linear, gamma, balance, unsure)
-        end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
+        jobs = plan_jobs(capture[0], sources, output, tuple(capture[1:]))
+        end = run_with_bar(jobs, sources, recipe, output)
     if end:
         raise typer.Exit(end)
 

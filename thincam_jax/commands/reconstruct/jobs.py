@@ -3,7 +3,7 @@
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from thincam_jax._core.files import write_whole, writing
 from thincam_jax.commands.reconstruct.options import Output, Sources
 from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
-from thincam_jax.measured.read import image_files
+from thincam_jax.measured.read import image_files, pair_backgrounds
 from thincam_jax.measured.write import LINEAR
 
 
@@ -24,6 +24,7 @@ class Job:
       image that is sharp everywhere.
     - `label`: that distance, for messages.
     - `beside`: further files.
+    - `others`: further exposures of the capture. `backgrounds`: of each, where they differ.
     """
 
     capture: Path
@@ -31,6 +32,8 @@ class Job:
     focus: int | None = 0
     label: str = ""
     beside: tuple[Path, ...] = ()
+    others: tuple[Path, ...] = ()
+    backgrounds: tuple[Path, ...] = ()
 
     @property
     def name(self) -> str:
@@ -46,24 +49,33 @@ class Job:
         return self.images[0].suffix.lower() == ".png"
 
 
-def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
-    """Jobs for a capture, or for each capture in a folder.
+def plan_jobs(
+    capture: Path, sources: Sources, output: Output, others: tuple[Path, ...] = ()
+) -> list[Job]:
+    """Jobs for a capture and `others`, its further exposures, or for each capture in a folder.
 
     Files of the folder that `sources` names are no captures. Nothing is written yet, but whether
     something can be is tried.
 
-    **Errors**: MeasurementError, one line, for a folder without captures or that is also the
-    output's, an output that cannot be written or that would overwrite an input, and two captures of
-    the same name.
+    **Errors**: MeasurementError, one line, for a folder without captures, that is also the output's
+    or one of several exposures, backgrounds that fit no captures, an output that cannot be written
+    or that would overwrite an input, and two captures of the same name.
     """
-    batch = capture.is_dir()
+    batch = capture.is_dir() and not others
     captures = _captures_in(capture, sources) if batch else [capture]
     folder = output.path if batch or output.path.is_dir() else output.path.parent
     if batch:
         _check_batch_folder(capture, folder)
     names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
-    planned = zip(captures, names, strict=True)
-    jobs = [job for c, n in planned for job in _jobs_of(c, n, sources, output)]
+    jobs = [
+        j for c, n in zip(captures, names, strict=True) for j in _jobs_of(c, n, sources, output)
+    ]
+    jobs = [replace(job, others=others) for job in jobs]
+    if isinstance(given := sources.background, Path) and given.is_dir():
+        found = pair_backgrounds([*captures, *others], given)
+        pairs = zip(captures, found, strict=not others)
+        each = {c: tuple(found) if others else (b,) for c, b in pairs}
+        jobs = [replace(job, backgrounds=each[job.capture]) for job in jobs]
     _check_names(jobs, sources)
     _check_writable(folder)
     return jobs
@@ -137,7 +149,7 @@ def _check_batch_folder(captures: Path, folder: Path) -> None:
 
 
 def _check_names(jobs: list[Job], sources: Sources) -> None:
-    read = (*sources.paths(), *(job.capture for job in jobs))
+    read = (*sources.paths(), *(path for job in jobs for path in (job.capture, *job.others)))
     inputs = {os.path.realpath(path) for path in read}  # also of links in a circle
     taken: dict[Path, Path] = {}
     for job in jobs:
