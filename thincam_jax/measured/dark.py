@@ -87,7 +87,7 @@ def without_hot_pixels(raw: Raw, dark: Raw, fill: bool) -> tuple[Raw, Raw]:
     """An image and its dark frame less the excess of hot pixels, which leaves their difference.
 
     So an examination finds no defects that the dark frame mends. Hot pixels at the image's largest
-    value are dead, or if `fill` only get the median of their neighbours.
+    value are dead, or if `fill` only get at least the median of their neighbours.
     """
     if raw.pixels.shape != dark.pixels.shape or raw.bits != dark.bits:
         return raw, dark  # refused later
@@ -97,7 +97,8 @@ def without_hot_pixels(raw: Raw, dark: Raw, fill: bool) -> tuple[Raw, Raw]:
     hot = excess > _HOT * max(1.48 * float(np.median(np.abs(excess))), 0.5 * counted)
     full = hot & (raw.pixels == raw.pixels.max())
     pixels = np.where(hot, raw.pixels - excess, raw.pixels)
-    pixels = np.where(full, scipy.ndimage.median_filter(pixels, **near), pixels)
+    least = np.where(full, scipy.ndimage.median_filter(pixels, **near), pixels)
+    pixels = np.maximum(pixels, least)  # saturated light is no less than what exceeds the dark
     pixels = np.maximum(np.rint(pixels), 0) if counted else pixels
     lost = full if full.ndim == 2 else full.any(axis=2)
     dead = raw.dead if fill or not lost.any() else lost | (False if raw.dead is None else raw.dead)

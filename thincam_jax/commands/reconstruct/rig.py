@@ -29,6 +29,8 @@ class Rig:
         psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
         given, of_psf = sources.psf, sources.psf_background
         self.background = self._level(sources.background, sources.bits)
+        if of_psf is None and self.background is None and sources.background is not None:
+            of_psf = "found"  # a folder is of the captures
         self.psf_background = self._level(of_psf, psf_bits)
         if isinstance(given, measured.Raw):
             self.psfs = [given]
@@ -114,9 +116,13 @@ class Rig:
             said = image.exposure or time
             if said == 0 or (time and abs(said / time - 1) > _SAME):
                 raise measured.MeasurementError(
-                    f"{image.name}: its exposure is {image.exposure or 'unknown'} s by its file and "
-                    f"{time or 'not given'} s by --exposure; give the right --exposure, as 4ms, of "
-                    "each of several files of one PSF or capture, or other scenes as a folder"
+                    f"{image.name}: exposure by its file: {_seconds(image.exposure)}, by --exposure: "
+                    f"{_seconds(time)}; give the right --exposure, as 4ms, of each of several files "
+                    "of one PSF or capture, or other scenes as a folder"
                 )
             times.append(said)
         return times
+
+
+def _seconds(time: float | None) -> str:
+    return f"{time:g} s" if time else "none"
