@@ -4,7 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from measured.test_examination import CAMERAS, DARK, SHAPE, counts, plain_image, quality, scene, seen
+from measured.test_examination import (
+    CAMERAS,
+    DARK,
+    SHAPE,
+    counts,
+    plain_image,
+    quality,
+    scene,
+    seen,
+)
 
 from thincam_jax.measured import MeasurementError, Raw, prepare
 from thincam_jax.measured.examination import examine
@@ -18,8 +27,9 @@ def exposures(light, brightest, **how):
     return [counts(light, n, brightest * 4**n, **how) for n in range(3)]
 
 
-def raws(images, **facts):
-    return [Raw(image, 12, name=f"{n}.tif", **facts) for n, image in enumerate(images)]
+def raws(images, times=TIMES, **facts):
+    pairs = enumerate(zip(images, times, strict=True))
+    return [Raw(image, 12, name=f"{n}.tif", exposure=t, **facts) for n, (image, t) in pairs]
 
 
 @pytest.mark.thorough
@@ -29,7 +39,7 @@ def test_as_good_as_a_psf_that_is_not_saturated(camera):
     true, light = scene(), CAMERAS[camera](SHAPE, 1)
     capture, best = Raw(counts(seen(true, light)), 12), Raw(counts(light, 1), 12)
     images = raws(exposures(light, 900.0))
-    merged = merge_images(images, TIMES)
+    merged = merge_images(images)
     assert merged.black_level == pytest.approx(DARK, abs=0.5)
     found = examine([capture], merged)
     assert found.psf is merged and not {one.name for one in found.findings} & {"flat", "replaced"}
@@ -47,7 +57,7 @@ def test_rate_of_each_pixel_and_what_all_saturate():
     """Unbiased to the brightest, with less noise than any one; order and names do not matter."""
     light = np.geomspace(1, 10_000, 90 * 116).reshape(SHAPE)
     images = exposures(light, 4500.0)
-    merged = merge_images(raws(images)[::-1], TIMES[::-1])
+    merged = merge_images(raws(images)[::-1])
     full = np.all([image == 4095 for image in images], axis=0)
     assert full.any()
     np.testing.assert_array_equal(merged.pixels == 4095, full)
@@ -58,7 +68,7 @@ def test_rate_of_each_pixel_and_what_all_saturate():
     assert abs(error.mean()) < 0.02 and error.std() < 0.9
     assert (merged.pixels - expected)[:20].std() < 0.3 * (images[0] - expected)[:20].std()
     # The same counts in 16 bits that nobody told of: the plateau is saturation.
-    untold = merge_images([Raw(image) for image in images], TIMES)
+    untold = merge_images([replace(one, bits=None) for one in raws(images)])
     np.testing.assert_allclose(untold.pixels, merged.pixels)
     assert untold.saturation == 4095
 
@@ -69,20 +79,20 @@ def test_dark_frames_and_dead_pixels():
     current = np.zeros(SHAPE)
     current[::7, ::5] = 200.0  # counts in the shortest
     images = exposures(light, 900.0)
-    dark = [Raw(np.uint16(np.minimum(DARK + current * 4**n, 4095)), 12) for n in range(3)]
+    dark = [Raw(np.minimum(DARK + current * 4**n, 4095).astype("u2"), 12) for n in range(3)]
     lit = [np.uint16(np.minimum(one + current * 4**n, 4095)) for n, one in enumerate(images)]
     holes = np.zeros(SHAPE, bool)
     holes[3, 4] = True
     given = raws(lit)
     given[1] = replace(given[1], dead=holes)
-    plain = merge_images(raws(images), TIMES, [float(DARK)] * 3)
-    found = merge_images(given, TIMES, dark)
+    plain = merge_images(raws(images), [float(DARK)] * 3)
+    found = merge_images(given[::-1], dark[::-1])
     level = found.black_level
     assert level == pytest.approx(np.mean(dark[0].pixels))
     difference = (found.pixels - level) - (plain.pixels - DARK)
     assert np.abs(difference).max() < 12 and found.dead is not None
     np.testing.assert_array_equal(found.dead, holes)
-    by_file = merge_images(raws(images, black_level=float(DARK)), TIMES)
+    by_file = merge_images(raws(images, black_level=float(DARK)))
     np.testing.assert_array_equal(by_file.pixels, plain.pixels)
 
 
@@ -90,9 +100,9 @@ def test_dark_frames_and_dead_pixels():
     ("change", "message"),
     [
         ("times", r"1.tif is 3\.\d+ times as bright as 0.tif.*exposed 2 times as long"),
-        ("scene", r"like it by 0\.\d+, .*other scenes as a folder"),
-        ("size", "have the .pixels, bits, pattern. .*; give images of one camera"),
-        ("zero", "with a time above 0 for each"),
+        ("scene", r"alike by 0\.\d+, .*other scenes as a folder"),
+        ("size", r"and .pixels, bits, pattern. .*; merged are equal images"),
+        ("zero", "have the exposures .0.0, .* whose file or `exposure`, as 4ms, says"),
     ],
 )
 def test_what_contradicts(change, message):
@@ -105,4 +115,4 @@ def test_what_contradicts(change, message):
     else:
         times[1 if change == "times" else 0] = 2e-3 if change == "times" else 0.0
     with pytest.raises(MeasurementError, match=message):
-        merge_images(raws(images), times)
+        merge_images(raws(images, times))

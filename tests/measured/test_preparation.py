@@ -252,7 +252,9 @@ def test_backgrounds_that_do_not_belong():
     floats = Raw(measured().astype(float))
     message = "PSF has an unknown full scale and the capture 12 bit.*same `bits`"
     refused(message, floats, grey, "corner")
-    log = prepare(floats, grey).log  # each level is its own
+    with pytest.warns(UserWarning, match="whose black may turn grey; a dark frame or a number"):
+        log = prepare(floats, grey).log  # each level is its own
+    prepare(floats, grey, 40.0)  # as it advises
     assert (log.psf.background, log.capture.background) == ("corner", "found with the image")
     refused("background = nan: give a finite number", grey, grey, math.nan)
 

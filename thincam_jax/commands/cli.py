@@ -30,8 +30,7 @@ ORDER = (
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
     "Calibration": (
-        *("background", "psf_background", "exposure", "dead", "bits", "psf_bits", "saturation"),
-        "noise",
+        *("background", "psf_background", "dead", "bits", "psf_bits", "saturation", "noise"),
     ),
     "Preparation": (
         *("downsample", "bayer", "demosaic", "noise_threshold", "psf_channels", "psf_scale"),

@@ -83,27 +83,24 @@ def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
     return bool((level - lowest <= _LIT * light).all())
 
 
-def without_hot_pixels(raw: Raw, dark: Raw, fill: bool) -> tuple[Raw, Raw]:
-    """An image and its dark frame less the excess of hot pixels, which leaves their difference.
+def without_hot_pixels(raw: Raw, dark: Raw) -> tuple[Raw, Raw]:
+    """An image and its dark frame less the excess of hot pixels; their difference stays.
 
-    So an examination finds no defects that the dark frame mends. Hot pixels at the image's largest
-    value are dead, or if `fill` only get at least the median of their neighbours.
+    An examination then finds none. Those at the image's largest value get at least the median of
+    their neighbours.
     """
     if raw.pixels.shape != dark.pixels.shape or raw.bits != dark.bits:
         return raw, dark  # refused later
     near = {"footprint": _NEAR if raw.pixels.ndim == 2 else _NEAR[..., None], "mode": "mirror"}
-    around, counted = scipy.ndimage.median_filter(dark.pixels, **near), raw.pixels.dtype.kind == "u"
+    around, step = scipy.ndimage.median_filter(dark.pixels, **near), raw.pixels.dtype.kind == "u"
     excess = dark.pixels.astype(float) - around
-    hot = excess > _HOT * max(1.48 * float(np.median(np.abs(excess))), 0.5 * counted)
-    full = hot & (raw.pixels == raw.pixels.max())
+    hot = excess > _HOT * max(1.48 * float(np.median(np.abs(excess))), 0.5 * step)
     pixels = np.where(hot, raw.pixels - excess, raw.pixels)
-    least = np.where(full, scipy.ndimage.median_filter(pixels, **near), pixels)
-    pixels = np.maximum(pixels, least)  # saturated light is no less than what exceeds the dark
-    pixels = np.maximum(np.rint(pixels), 0) if counted else pixels
-    lost = full if full.ndim == 2 else full.any(axis=2)
-    dead = raw.dead if fill or not lost.any() else lost | (False if raw.dead is None else raw.dead)
+    least = np.maximum(pixels, scipy.ndimage.median_filter(pixels, **near))
+    pixels = np.where(hot & (raw.pixels == raw.pixels.max()), least, pixels)
+    pixels = np.maximum(np.rint(pixels), 0) if step else pixels
     quiet = replace(dark, pixels=np.where(hot, around, dark.pixels))
-    return replace(raw, pixels=pixels.astype(raw.pixels.dtype), dead=dead), quiet
+    return replace(raw, pixels=pixels.astype(raw.pixels.dtype)), quiet
 
 
 def _corners(shape: tuple[int, ...], corner: tuple[int, int]) -> list[tuple[slice, slice]]:

@@ -164,6 +164,10 @@ def _found(planes, backgrounds: dict[str, Background], raws, options: Preparatio
         return corner_levels(planes, (slice(None), side, side))
     comparable = raws["psf"].bits == raws["capture"].bits
     found = find_levels(planes, options.corner, options.bayer, comparable)
+    if "capture" in sought and not comparable:
+        text = f"{raws['capture'].name}: its background is found with the image, whose black may "
+        text += "turn grey; a dark frame or a number of counts is better"
+        warnings.warn(text, stacklevel=4)
     if "psf" in sought and found.sources["psf"] != "corner":
         warnings.warn(
             f"no corner of the PSF ({raws['psf'].name}) is dark: its lowest value is taken as its "

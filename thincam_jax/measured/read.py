@@ -173,21 +173,22 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
     return sorted(paths, key=_order)
 
 
-def pair_backgrounds(captures: Sequence[Path], folder: Path) -> list[Path]:
+def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
     """List the background of each capture: that of its name, or all of the folder in order.
 
-    **Errors**: CaptureFileError where only some names agree, or none does and the counts differ.
+    None where it is no folder's path. **Errors**: CaptureFileError where only some names agree, or
+    none does and the counts differ.
     """
+    if not (isinstance(folder, Path) and folder.is_dir()):
+        return []
     named = {path.stem: path for path in image_files(folder)}
-    common = sum(capture.stem in named for capture in captures)
-    if common == len(captures):
-        return [named[capture.stem] for capture in captures]
-    if common or len(named) != len(captures):
+    alike = [named[capture.stem] for capture in captures if capture.stem in named]
+    if len(captures) not in (len(alike), len(named)) or 0 < len(alike) < len(captures):
         raise CaptureFileError(
-            f"{folder}: holds {len(named)} backgrounds for {len(captures)} captures, {common} of "
-            "them named as one; name all as their captures, give as many, or one file for all"
+            f"{folder}: holds {len(named)} backgrounds for {len(captures)} captures, {len(alike)} "
+            "named as one; name all as their captures, give as many, or one file for all"
         )
-    return list(named.values())
+    return alike or list(named.values())
 
 
 def _order(path: Path) -> tuple[list[tuple[int, str]], str]:

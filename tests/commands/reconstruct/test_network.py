@@ -50,6 +50,7 @@ def test_a_capture_is_focused_and_what_is_not_sure_is_marked(files):
 
 
 @pytest.mark.thorough
+@pytest.mark.filterwarnings("default")
 def test_what_does_not_fit_is_one_line(files):
     for given, message in (
         ((call(files, distance="3 m")), "distance = 3000 mm lies outside of what the network was"),
@@ -62,5 +63,9 @@ def test_what_does_not_fit_is_one_line(files):
         ),
         ((call(files, "--network", files / "capture.tif")), "is no file of a network"),
         ((call(files, "--psf", files / "capture.tif")), "give either --psf"),
+        (
+            (call(files, "--background", "found")),
+            "a network finds no background, as solvers do; give",
+        ),
     ):
         assert message in one_line(given)

@@ -14,11 +14,7 @@ METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
 
 Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
 Background = Annotated[
-    str | None,
-    Option(
-        help="Dark frame, folder of one for each capture, number of counts, or corner of the PSF. "
-        "Default: found."
-    ),
+    str | None, Option(help="Dark frame, a folder of one each, counts, corner or (default) found.")
 ]
 PsfBackground = Annotated[
     str | None, Option(help="That of the PSF, where it was exposed otherwise.")
@@ -46,19 +42,13 @@ Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where de
 
 
 def reconstruct(
-    capture: Annotated[
-        list[Path],
-        Option(help="Capture of the same size; or a folder of captures. Several: exposures of it."),
-    ],
+    capture: Annotated[list[Path], Option(help="Capture, or a folder; several: its exposures.")],
     out: Annotated[
         Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
     ],
-    psf: Annotated[
-        list[Path] | None, Option(help="Measured PSF: TIFF, PNG or NPY. Several: exposures of it.")
-    ] = None,
+    psf: Annotated[list[Path] | None, Option(help="Measured PSF; several: its exposures.")] = None,
     exposure: Annotated[
-        list[str] | None,
-        Option(help="As 4ms, of each of several exposures, where the files do not say it."),
+        list[str] | None, Option(help="As 4ms, of each exposure whose file does not say it.")
     ] = None,
     distances: Annotated[
         str | None,

@@ -1,19 +1,28 @@
-"""Plan which captures are reconstructed into which files, checked before any work."""
+"""Jobs: which captures become which files, checked before any work, and what each is made of."""
 
+import functools
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from thincam_jax import measured
 from thincam_jax._core.files import write_whole, writing
-from thincam_jax.commands.reconstruct.options import Output, Sources
+from thincam_jax.commands import terminal
+from thincam_jax.commands.reconstruct.options import Background, Output, Sources
 from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
+from thincam_jax.measured.dark import without_hot_pixels
+from thincam_jax.measured.examination import Examination, Finding, examine
+from thincam_jax.measured.merging import merge_images
+from thincam_jax.measured.preparation import Background as Level
 from thincam_jax.measured.read import image_files, pair_backgrounds
 from thincam_jax.measured.write import LINEAR
+
+_ROUNDED = 0.1  # relative difference of two statements of an exposure
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,99 @@ class Job:
         return self.images[0].suffix.lower() == ".png"
 
 
+class Rig:
+    """`Sources`, read once."""
+
+    def __init__(self, sources: Sources):
+        self.sources, self.warned = sources, set[str]()
+        self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
+        self._dark = functools.lru_cache(8)(measured.read_image)
+        psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
+        given, of_psf = sources.psf, sources.psf_background
+        self.background = self._level(sources.background, sources.bits)
+        if of_psf is None and self.background is None and sources.background is not None:
+            of_psf = "found"  # a folder is of the captures
+        self.psf_background = self._level(of_psf, psf_bits)
+        if isinstance(given, measured.Raw):
+            self.psfs = [given]
+        elif sources.distances:
+            assert isinstance(given, Path)
+            self.psfs = measured.read_images(given, psf_bits)
+            if len(self.psfs) != len(sources.distances):
+                raise MeasurementError(
+                    f"{given}: holds {len(self.psfs)} PSFs for {len(sources.distances)} distances; "
+                    "give one for each, nearest first"
+                )
+        else:
+            files = given if isinstance(given, tuple) else (given,)
+            paired = pair_backgrounds(files, of_psf)
+            psf, self.psf_background = self._read(files, paired, psf_bits, True)
+            self.psfs = [psf]
+
+    def examine(self, job: Job) -> tuple[Examination, Level | None]:
+        """Examination of a job's capture, and its background."""
+        files = job.capture, *job.others
+        image, background = self._read(files, job.backgrounds, self.sources.bits, False)
+        found = examine([image], self.psfs[job.focus or 0], self.sources.preparation)
+        return found, background
+
+    def prepare(self, capture: Path) -> measured.Prepared:
+        paired = tuple(pair_backgrounds([capture], self.sources.background))
+        return self.ready(*self.examine(Job(capture, (), backgrounds=paired)))
+
+    def ready(self, examined: Examination, background: Level | None) -> measured.Prepared:
+        psf, (image,) = examined.psf, examined.captures
+        assert psf is not None
+        known = {"psf_background": self.psf_background, "dead": self.dead}
+        return measured.prepare(psf, image, background, self.sources.preparation, **known)
+
+    def tell(self, findings: Sequence[Finding], strict: bool) -> None:
+        """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
+        lines = [str(one) for one in findings]
+        terminal.warn([line for line in lines if line not in self.warned])
+        self.warned.update(lines)
+        if bad := [str(one) for one in findings if strict and one.severe]:
+            raise MeasurementError(f"{bad[0]} (an error by --strict)")
+
+    def _level(self, given: Background, bits: int | None) -> Level | None:
+        """The background of all images; None of a folder, which has one for each."""
+        is_file = isinstance(given, Path) and not given.is_dir()
+        return self._dark(given, bits) if is_file else None if isinstance(given, Path) else given
+
+    def _read(
+        self, files: Sequence[Path], paired: Sequence[Path], bits: int | None, is_psf: bool
+    ) -> tuple[measured.Raw, Level | None]:
+        """One image, merged of its exposures, and its background; `paired`: that of each file."""
+        n, times = len(files), self.sources.exposures
+        times = (times[:n] if is_psf else times[-n:]) or (None,) * n
+        images = [self._image(*one, bits) for one in zip(files, times, strict=True)]
+        level = self.psf_background if is_psf else self.background
+        if is_psf and level is None and isinstance(self.background, measured.Raw):
+            level = self.background if self.background.bits == images[0].bits else None
+        levels: list[Any] = [self._dark(path, bits) for path in paired] or [level] * n
+        for i, one in enumerate(levels):
+            if isinstance(one, measured.Raw):
+                images[i], levels[i] = without_hot_pixels(images[i], one)
+        if n == 1:
+            return images[0], levels[0]
+        known = None if levels[0] in (None, "corner", "found") else levels
+        merged = merge_images(images, known, self.sources.preparation.saturation)
+        return merged, merged.black_level
+
+    def _image(self, path: Path, exposure: float | None, bits: int | None) -> measured.Raw:
+        """An image with its exposure and the dead pixels of the map, where that has its size."""
+        image = measured.read_image(path, bits)
+        said, dead = image.exposure or exposure, image.dead
+        if said and exposure and abs(said / exposure - 1) > _ROUNDED:
+            raise MeasurementError(
+                f"{path}: its exposure is {said:g} s by the file and {exposure:g} s by --exposure; "
+                "leave --exposure out, or remove the wrong tag"
+            )
+        if self.dead is not None and self.dead.shape == image.pixels.shape[:2]:
+            dead = self.dead if dead is None else self.dead | dead
+        return replace(image, exposure=said, dead=dead)
+
+
 def plan_jobs(
     capture: Path, sources: Sources, output: Output, others: tuple[Path, ...] = ()
 ) -> list[Job]:
@@ -67,15 +169,12 @@ def plan_jobs(
     if batch:
         _check_batch_folder(capture, folder)
     names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
-    jobs = [
-        j for c, n in zip(captures, names, strict=True) for j in _jobs_of(c, n, sources, output)
-    ]
-    jobs = [replace(job, others=others) for job in jobs]
-    if isinstance(given := sources.background, Path) and given.is_dir():
-        found = pair_backgrounds([*captures, *others], given)
-        pairs = zip(captures, found, strict=not others)
-        each = {c: tuple(found) if others else (b,) for c, b in pairs}
-        jobs = [replace(job, backgrounds=each[job.capture]) for job in jobs]
+    planned = zip(captures, names, strict=True)
+    jobs = [job for c, n in planned for job in _jobs_of(c, n, sources, output)]
+    found = pair_backgrounds([*captures, *others], sources.background)
+    pairs = {c: tuple(found) if others else (b,) for c, b in zip(captures, found, strict=False)}
+    more = [{"others": others, "backgrounds": pairs.get(job.capture, ())} for job in jobs]
+    jobs = [replace(job, **given) for job, given in zip(jobs, more, strict=True)]
     _check_names(jobs, sources)
     _check_writable(folder)
     return jobs

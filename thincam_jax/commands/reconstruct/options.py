@@ -244,16 +244,12 @@ def known_psf(
 
 
 def read_exposures(texts: Sequence[str], *counts: int) -> tuple[float, ...]:
-    """Exposures, s, of the files of PSF and capture, of which there are so many.
-
-    **Errors**: MeasurementError for what is no time, and another number.
-    """
+    """Exposures, s, of so many files of PSF and capture; MeasurementError for another number."""
     try:
         times = tuple(parse_quantity(text, "time") for text in texts)
     except ValueError as error:
         raise MeasurementError(f"--exposure: {error}") from None
-    several = [n for n in counts if n > 1]
-    if times and len(times) not in {sum(several), *(several[:1] if len(set(several)) == 1 else ())}:
+    if times and len(times) != sum(n for n in counts if n > 1):
         raise MeasurementError(
             f"--exposure is given {len(times)} times, for {counts[0]} --psf and {counts[1]} "
             "--capture; give one for each of what is given several times, the PSF's first"

@@ -16,9 +16,8 @@ from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.interrupt import INTERRUPTED
-from thincam_jax.commands.reconstruct.jobs import Job, write_job
+from thincam_jax.commands.reconstruct.jobs import Job, Rig, write_job
 from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources
-from thincam_jax.commands.reconstruct.rig import Rig
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
 from thincam_jax.measured.examination import Finding, finding
 from thincam_jax.measured.write import LINEAR, linear_bytes
@@ -262,6 +261,11 @@ def _focus(job: Job, ready: measured.Prepared, focusing: Focusing, noise: PixelN
         raise measured.MeasurementError(
             f"{int((~ready.valid).sum())} pixels of the capture are dead or saturated, and a "
             "network needs every pixel; repair them, or use another method"
+        )
+    if ready.log.capture.background == "found with the image":
+        raise measured.MeasurementError(
+            f"{job.capture}: a network finds no background, as solvers do; give --background, a "
+            "dark frame or a number of counts"
         )
     try:
         found = read(focusing.network, ready.capture, [focusing.distance], noise.deviation)
