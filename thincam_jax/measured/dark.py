@@ -13,9 +13,7 @@ from thincam_jax.measured.raw import Raw
 
 _LIT = 0.15  # largest part of the mean light that a dark place may hold
 _HOT = 8.0  # standard deviations of a dark frame
-_NEAR = (
-    np.add.outer(np.arange(5) % 2, np.arange(5) % 2) == 0
-)  # pixels of one colour, also of a mosaic
+_NEAR = np.add.outer(np.arange(5) % 2, np.arange(5) % 2) == 0  # one colour, also of a mosaic
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,38 +30,37 @@ def corner_levels(planes: Mapping[str, np.ndarray], square: tuple[Any, ...]) -> 
     level = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     level = level.astype(np.float32)
     mean = level.mean(axis=0, keepdims=True)
-    levels = {"psf": level, "capture": level if len(level) == len(planes["capture"]) else mean}
+    levels = {
+        "psf": level,
+        "capture": level if len(level) == len(planes.get("capture", ())) else mean,
+    }
     return Found(levels, dict.fromkeys(levels, "corner"), square)
 
 
 def find_levels(
-    planes: Mapping[str, np.ndarray],
-    corner: tuple[int, int],
-    bayer: Pattern | None,
-    comparable: bool = True,
+    planes: Mapping[str, np.ndarray], corner: tuple[int, int], bayer: Pattern | None
 ) -> Found:
     """Find black levels of a PSF and a capture (channel, y, x), both in parts of one full scale.
 
     The mean of the PSF's first corner that `is_dark`, beginning with the upper left. A capture that
     is darker than that was exposed otherwise: nothing is subtracted, and its level is found with
     the image. Without a dark corner the level of the PSF is the lowest median of 3×3 pixels of both
-    images, which no black level exceeds, and nothing is subtracted of the capture.
+    images, which no black level exceeds, and nothing is subtracted of the capture; nor of one that is
+    left out, as its scale is another.
 
     - `corner`: start and stop of a square, from each corner.
-    - `comparable`: whether one bit depth makes the PSF's level tell that of the capture.
     """
     side = corner[1] - corner[0]
     squares = [(slice(None), *square) for square in _corners(planes["psf"].shape, corner)]
     for square in squares:
         found = corner_levels(planes, square)
         if is_dark(planes["psf"], found.levels["psf"], side):
-            of_capture = planes["capture"], found.levels["capture"], side
-            if not (comparable and is_dark(*of_capture)):
+            capture = planes.get("capture")
+            if capture is None or not is_dark(capture, found.levels["capture"], side):
                 found.sources["capture"] = "found with the image"
                 found.levels["capture"] = np.zeros((1, 1, 1), np.float32)
             return found
-    seen = [one for name, one in planes.items() if comparable or name == "psf"]
-    lowest = np.float32(min(_lowest(one, bayer) for one in seen)).reshape(1, 1, 1)
+    lowest = np.float32(min(_lowest(one, bayer) for one in planes.values())).reshape(1, 1, 1)
     levels = {"psf": lowest, "capture": np.zeros_like(lowest)}
     sources = {"psf": "lowest value", "capture": "found with the image"}
     return Found(levels, sources, squares[0])

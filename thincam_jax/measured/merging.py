@@ -64,12 +64,11 @@ def merge_images(
 
 def _common_level(counts: np.ndarray, seen: np.ndarray, t: np.ndarray) -> float:
     """Level at which the shortest and the longest usable exposure agree; 0 of equal ones."""
-    usable = [n for n in range(len(t)) if seen[n].sum() >= _FEW and t[n] > 1.05 * t[0]]
-    if not usable:
+    n = max(n for n in range(len(t)) if n == 0 or (seen[0] & seen[n]).sum() >= _FEW)
+    both, ratio = seen[0] & seen[n], t[n] / t[0]
+    if ratio < 1.05:
         return 0.0
-    both, ratio = seen[0] & seen[usable[-1]], t[usable[-1]] / t[0]
-    near, far = (float(counts[n][both].mean()) for n in (0, usable[-1]))
-    return max((ratio * near - far) / (ratio - 1), 0.0)
+    return max(float((ratio * counts[0] - counts[n])[both].mean()) / (ratio - 1), 0.0)
 
 
 def _check(images: Sequence[Raw], signal: np.ndarray, seen: np.ndarray) -> None:

@@ -163,7 +163,8 @@ def _found(planes, backgrounds: dict[str, Background], raws, options: Preparatio
         side = slice(*options.corner)
         return corner_levels(planes, (slice(None), side, side))
     comparable = raws["psf"].bits == raws["capture"].bits
-    found = find_levels(planes, options.corner, options.bayer, comparable)
+    seen = planes if comparable else {"psf": planes["psf"]}
+    found = find_levels(seen, options.corner, options.bayer)
     if "capture" in sought and not comparable:
         text = f"{raws['capture'].name}: its background is found with the image, whose black may "
         text += "turn grey; a dark frame or a number of counts is better"

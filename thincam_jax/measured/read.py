@@ -270,9 +270,8 @@ def _exposure(*given: Any) -> _Facts:
     """The first exposure time, s, that is a number above 0; TIFF has (numerator, denominator)."""
     for one in given:
         with contextlib.suppress(TypeError, ValueError, ZeroDivisionError):
-            time = one[0] / one[1] if isinstance(one, tuple) else float(one)
-            if 0 < time < float("inf"):
-                return {"exposure": float(time)}
+            if 0 < (time := float(one[0] / one[1] if isinstance(one, tuple) else one)) < np.inf:
+                return {"exposure": time}
     return {}
 
 

@@ -63,6 +63,7 @@ def test_merged_is_as_good_as_unsaturated(files, tmp_path):
     bright = tifffile.imread(psfs[2]) > simulated.DARK + 900 * 16 * 0.05
     assert np.mean(tifffile.imread(psfs[2])[bright] == 4095) > 0.4
     plain = ("--capture", files["capture"])
+    given_psfs = (*each("--psf", psfs), *plain)
     for name, given in {
         "best": ("--psf", files["psf"], *plain),
         "longest": ("--psf", psfs[2], *plain),
@@ -86,6 +87,8 @@ def test_merged_is_as_good_as_unsaturated(files, tmp_path):
     assert record["exposures"] == [str(path) for path in captures]
     assert record["sources"]["psf"] == [str(path) for path in psfs]
     assert record["preparation"]["psf"]["level"][0] * 4095 == pytest.approx(40, abs=0.5)
+    tagged(files["capture"], 0.5)  # one capture, whose own exposure does not matter
+    assert call(tmp_path / "again.npy", *each("--exposure", TIMES), *given_psfs).exit_code == 0
     for path, seconds in zip(psfs, (1e-3, 4e-3, 16e-3), strict=True):
         tagged(path, seconds)
     out = tmp_path / "tagged.npy"
@@ -207,9 +210,7 @@ class TestFolderOfBackgrounds:
         given = ("--psf", tmp_path / "psf.tif", "--capture", captures)
         line = one_line(call(tmp_path / "out", *given, "--background", backgrounds))
         common = 2 if left == 2 else 0
-        assert (
-            f"holds 2 backgrounds for 3 captures, {common} of them named as one; name all" in line
-        )
+        assert f"holds 2 backgrounds for 3 captures, {common} named as one; name all" in line
         assert not (tmp_path / "out").exists()
 
     @pytest.mark.thorough

@@ -50,7 +50,6 @@ def test_a_capture_is_focused_and_what_is_not_sure_is_marked(files):
 
 
 @pytest.mark.thorough
-@pytest.mark.filterwarnings("default")
 def test_what_does_not_fit_is_one_line(files):
     for given, message in (
         ((call(files, distance="3 m")), "distance = 3000 mm lies outside of what the network was"),

@@ -121,8 +121,8 @@ class Rig:
         self, files: Sequence[Path], paired: Sequence[Path], bits: int | None, is_psf: bool
     ) -> tuple[measured.Raw, Level | None]:
         """One image, merged of its exposures, and its background; `paired`: that of each file."""
-        n, times = len(files), self.sources.exposures
-        times = (times[:n] if is_psf else times[-n:]) or (None,) * n
+        n, given = len(files), self.sources.exposures if len(files) > 1 else ()
+        times = (given[:n] if is_psf else given[-n:]) or (None,) * n
         images = [self._image(*one, bits) for one in zip(files, times, strict=True)]
         level = self.psf_background if is_psf else self.background
         if is_psf and level is None and isinstance(self.background, measured.Raw):
@@ -173,8 +173,7 @@ def plan_jobs(
     jobs = [job for c, n in planned for job in _jobs_of(c, n, sources, output)]
     found = pair_backgrounds([*captures, *others], sources.background)
     pairs = {c: tuple(found) if others else (b,) for c, b in zip(captures, found, strict=False)}
-    more = [{"others": others, "backgrounds": pairs.get(job.capture, ())} for job in jobs]
-    jobs = [replace(job, **given) for job, given in zip(jobs, more, strict=True)]
+    jobs = [replace(j, others=others, backgrounds=pairs.get(j.capture, ())) for j in jobs]
     _check_names(jobs, sources)
     _check_writable(folder)
     return jobs

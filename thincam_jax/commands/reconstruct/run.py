@@ -109,6 +109,12 @@ def run_jobs(
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report | None) -> Finished:
     began = time.perf_counter()
     examined, background = rig.examine(job)
+    known = background not in (None, "found") or examined.captures[0].black_level is not None
+    if recipe.focusing is not None and not known:
+        raise measured.MeasurementError(
+            f"{job.capture}: a network finds no background, as solvers do; give --background, a "
+            "dark frame or a number of counts"
+        )
     ready = rig.ready(examined, background)
     _check_channels(job, ready, recipe, output)
     rig.tell(examined.findings, recipe.strict)
@@ -261,11 +267,6 @@ def _focus(job: Job, ready: measured.Prepared, focusing: Focusing, noise: PixelN
         raise measured.MeasurementError(
             f"{int((~ready.valid).sum())} pixels of the capture are dead or saturated, and a "
             "network needs every pixel; repair them, or use another method"
-        )
-    if ready.log.capture.background == "found with the image":
-        raise measured.MeasurementError(
-            f"{job.capture}: a network finds no background, as solvers do; give --background, a "
-            "dark frame or a number of counts"
         )
     try:
         found = read(focusing.network, ready.capture, [focusing.distance], noise.deviation)
