@@ -96,13 +96,28 @@ def test_dark_frames_and_dead_pixels():
     np.testing.assert_array_equal(by_file.pixels, plain.pixels)
 
 
+def test_equal_exposures_are_averaged():
+    """They tell no black level, which is then found as of one image."""
+    light = CAMERAS["spots"](SHAPE, 1)
+    images = [counts(light, n, 3000.0) for n in range(4)]
+    merged = merge_images(raws(images, (2e-3,) * 4))
+    np.testing.assert_allclose(merged.pixels, np.mean(images, axis=0), rtol=1e-6)
+    assert merged.black_level is None
+    known = merge_images(raws(images, (2e-3,) * 4), [0.0] * 4)
+    np.testing.assert_array_equal(known.pixels, merged.pixels)
+    assert known.black_level == 0 and merged.exposure == 2e-3
+    colours = zip(exposures(light, 900.0), exposures(light, 450.0), strict=True)
+    two = merge_images(raws([np.stack(pair, -1) for pair in colours]))
+    assert two.pixels.shape == (*SHAPE, 2) and two.black_level == pytest.approx(64, abs=0.5)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ("times", r"1.tif is 3\.\d+ times as bright as 0.tif.*exposed 2 times as long"),
-        ("scene", r"alike by 0\.\d+, .*other scenes as a folder"),
-        ("size", r"and .pixels, bits, pattern. .*; merged are equal images"),
-        ("zero", "have the exposures .0.0, .* whose file or `exposure`, as 4ms, says"),
+        ("scene", r"alike by 0\.\d+, .*give linear images of one"),
+        ("size", r"and .pixels, bits, pattern. .*; merge equal images"),
+        ("zero", "have the exposures .0.0, .* whose files or `exposure`, as 4ms, say"),
     ],
 )
 def test_what_contradicts(change, message):

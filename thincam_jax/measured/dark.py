@@ -45,8 +45,7 @@ def find_levels(
     The mean of the PSF's first corner that `is_dark`, beginning with the upper left. A capture that
     is darker than that was exposed otherwise: nothing is subtracted, and its level is found with
     the image. Without a dark corner the level of the PSF is the lowest median of 3×3 pixels of both
-    images, which no black level exceeds, and nothing is subtracted of the capture; nor of one that is
-    left out, as its scale is another.
+    images, which no black level exceeds, and nothing is subtracted of the capture, as of none.
 
     - `corner`: start and stop of a square, from each corner.
     """
@@ -81,10 +80,9 @@ def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
 
 
 def without_hot_pixels(raw: Raw, dark: Raw) -> tuple[Raw, Raw]:
-    """An image and its dark frame less the excess of hot pixels; their difference stays.
+    """An image and its dark frame less the excess of hot pixels, which an examination would find.
 
-    An examination then finds none. Those at the image's largest value get at least the median of
-    their neighbours.
+    Those at the image's largest value get at least the median of their neighbours.
     """
     if raw.pixels.shape != dark.pixels.shape or raw.bits != dark.bits:
         return raw, dark  # refused later

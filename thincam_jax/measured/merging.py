@@ -9,8 +9,7 @@ import scipy
 from thincam_jax.measured.examination import plateau
 from thincam_jax.measured.raw import MeasurementError, Raw
 
-_WRONG = 0.2  # relative difference of the brightness from the exposures
-_ALIKE = 0.9  # correlation of blurred images of one thing
+_WRONG, _ALIKE = 0.2, 0.9  # relative difference of brightness and times; correlation, blurred
 _BLUR, _FEW = 5, 50  # pixels
 
 
@@ -26,7 +25,7 @@ def merge_images(
     noise. Returned is :math:`b + r t` of the shortest t; saturated in all, a pixel stays so.
 
     - `dark`: b of each, a frame or counts. None: the files' `black_level`, else the level at which
-      the shortest and the longest agree. The result's `black_level` is its mean.
+      the shortest and the longest agree, if any. The result's `black_level` is its mean.
     - `saturation`: part of full scale. None: full scale, or a plateau below.
 
     **Errors**: MeasurementError for unlike images, exposures that are missing or contradicted.
@@ -36,8 +35,8 @@ def merge_images(
     if not all(one.exposure for one in images) or len(kinds) > 1:
         raise MeasurementError(
             f"{names} have the exposures {[one.exposure for one in images]} s and (pixels, bits, "
-            f"pattern) {kinds}; merged are equal images whose file or `exposure`, as 4ms, says the "
-            "time of each; give other scenes as a folder"
+            f"pattern) {kinds}; merge equal images whose files or `exposure`, as 4ms, say the time "
+            "of each; give other scenes as a folder"
         )
     pairs = zip(images, dark or [one.black_level for one in images], strict=True)
     images, levels = zip(*sorted(pairs, key=lambda pair: pair[0].exposure or 0), strict=True)
@@ -46,9 +45,13 @@ def merge_images(
     most = first.full_scale * (saturation or (1.0 if first.bits else np.inf))
     if saturation is None:
         most = min([most, *(float(one.pixels.max()) for one in images if plateau(one.pixels))])
-    seen = counts < most
+    seen, last = counts < most, len(t)
     if any(one is None for one in levels):
-        levels = [_common_level(counts, seen, t)] * len(t)
+        usable = [n for n in range(len(t)) if (seen[0] & seen[n]).sum() >= _FEW]
+        last = max((n for n in usable if t[n] > 1.05 * t[0]), default=0)
+        both, ratio = seen[0] & seen[last], t[last] / t[0]
+        above = (ratio * counts[0] - counts[last])[both]
+        levels = [max(float(above.mean()) / (ratio - 1), 0.0) if last else 0.0] * len(t)
     levels = [one.pixels if isinstance(one, Raw) else one for one in levels]
     signal = counts - np.stack([np.broadcast_to(one, counts.shape[1:]) for one in levels])
     _check(images, signal, seen)
@@ -57,18 +60,12 @@ def merge_images(
     level, below = float(np.mean(levels[0])), np.nextafter(np.float32(most), np.float32(0))
     pixels = np.where(seen.any(axis=0), np.minimum(level + rate * t[0], below), most)
     dead = [one.dead for one in images if one.dead is not None]
-    facts = {"black_level": level, "saturation": most if np.isfinite(most) else None}
-    facts |= {"dead": np.any(dead, axis=0) if dead else None}
+    facts = {"saturation": most} if np.isfinite(most) else {}
+    facts |= {
+        "black_level": level if last else None,
+        "dead": np.any(dead, axis=0) if dead else None,
+    }
     return replace(first, pixels=pixels.astype(np.float32), name=names, **facts)
-
-
-def _common_level(counts: np.ndarray, seen: np.ndarray, t: np.ndarray) -> float:
-    """Level at which the shortest and the longest usable exposure agree; 0 of equal ones."""
-    n = max(n for n in range(len(t)) if n == 0 or (seen[0] & seen[n]).sum() >= _FEW)
-    both, ratio = seen[0] & seen[n], t[n] / t[0]
-    if ratio < 1.05:
-        return 0.0
-    return max(float((ratio * counts[0] - counts[n])[both].mean()) / (ratio - 1), 0.0)
 
 
 def _check(images: Sequence[Raw], signal: np.ndarray, seen: np.ndarray) -> None:
@@ -85,6 +82,5 @@ def _check(images: Sequence[Raw], signal: np.ndarray, seen: np.ndarray) -> None:
         if alike < _ALIKE or abs(found / ratio - 1) > _WRONG:
             raise MeasurementError(
                 f"{other.name} is {found:.3g} times as bright as {one.name}, alike by {alike:.2f}, "
-                f"and exposed {ratio:.3g} times as long; give linear images of one thing and each "
-                "its `exposure`, other scenes as a folder"
+                f"and exposed {ratio:.3g} times as long; give linear images of one, and `exposure`"
             )

@@ -166,9 +166,8 @@ def _found(planes, backgrounds: dict[str, Background], raws, options: Preparatio
     seen = planes if comparable else {"psf": planes["psf"]}
     found = find_levels(seen, options.corner, options.bayer)
     if "capture" in sought and not comparable:
-        text = f"{raws['capture'].name}: its background is found with the image, whose black may "
-        text += "turn grey; a dark frame or a number of counts is better"
-        warnings.warn(text, stacklevel=4)
+        text = "its background is found with the image, whose black may turn grey; a dark frame or"
+        warnings.warn(f"{raws['capture'].name}: {text} a number of counts is better", stacklevel=4)
     if "psf" in sought and found.sources["psf"] != "corner":
         warnings.warn(
             f"no corner of the PSF ({raws['psf'].name}) is dark: its lowest value is taken as its "

@@ -174,10 +174,9 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
-    """List the background of each capture: that of its name, or all of the folder in order.
+    """List the background of each capture: that of its name, or all in order; none of no folder.
 
-    None where it is no folder's path. **Errors**: CaptureFileError where only some names agree, or
-    none does and the counts differ.
+    **Errors**: CaptureFileError where only some names agree, or none does and the counts differ.
     """
     if not (isinstance(folder, Path) and folder.is_dir()):
         return []
@@ -328,9 +327,8 @@ def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
         sites = [letters[n] for n in file.raw_colors_visible[:2, :2].ravel()]
         sites = "".join(sites) if np.asarray(file.raw_pattern).size == 4 else ""
         facts = _sensor_facts(sites, file.black_level_per_channel, [int(file.white_level)])
-        shutter = getattr(getattr(file, "other", None), "shutter_speed", None)
-        facts |= {"orientation": _FLIPS[file.sizes.flip], **_exposure(shutter)}
-        return [pixels], {"bits": 16, **facts}
+        facts |= _exposure(getattr(getattr(file, "other", None), "shutter_speed", None))
+        return [pixels], {"bits": 16, **facts, "orientation": _FLIPS[file.sizes.flip]}
 
 
 def _sensor_facts(sites: str, black: Any, white: Any) -> _Facts:

@@ -101,13 +101,12 @@ def test_times_that_are_missing_or_contradict(files, tmp_path):
     given = (*each("--psf", psfs), "--capture", files["capture"])
     line = one_line(call(out, *given))
     assert line.startswith(f"{psfs[0]} + ") and "have the exposures [None, None, None] s" in line
-    assert "whose file or --exposure, as 4ms, says the time of each; give other scenes" in line
+    assert "whose files or --exposure, as 4ms, say the time of each; give other scenes" in line
     line = one_line(call(out, *given, "--exposure", "1ms"))
     assert line.startswith("--exposure is given 1 times, for 3 --psf and 1 --capture; give one for")
     assert "--exposure: " in one_line(call(out, *given, "--exposure", "4"))
     line = one_line(call(out, *given, *each("--exposure", ("1ms", "2ms", "16ms"))))
-    assert "and exposed 2 times as long" in line and "give linear images of one thing" in line
-    assert "each its --exposure" in line
+    assert line.endswith("exposed 2 times as long; give linear images of one, and --exposure")
     tagged(psfs[1], 8e-3)
     line = one_line(call(out, *given, *each("--exposure", TIMES)))
     assert "is 0.008 s by the file and 0.004 s by --exposure; leave" in line

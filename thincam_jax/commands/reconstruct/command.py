@@ -131,13 +131,11 @@ def reconstruct(
     with reported(lambda: nothing):
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
-        from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
         from thincam_jax.commands.reconstruct.run import run_with_bar
         from thincam_jax.measured import Preparation
 
-        psfs = psf or []
-        known, focusing = options.known_psf(psfs, camera, set_, network, distance)
-        sources = Sources(
+        known, focusing = options.known_psf(psf or (), camera, set_, network, distance)
+        sources = options.Sources(
             known,
             options.read_background(background),
             0.0 if camera else options.read_background(psf_background),
@@ -155,10 +153,10 @@ def reconstruct(
                 psf_channels=psf_channels,
             ),
             psf_bits,
-            options.read_distances(distances, psfs),
-            options.read_exposures(exposure or (), len(psfs), len(capture)),
+            options.read_distances(distances, psf or ()),
+            options.read_exposures(exposure or (), len(psf or ()), len(capture)),
         )
-        recipe = Recipe(
+        recipe = options.Recipe(
             method=method.replace("-", "_"),
             tau=tau,
             iterations=iterations,
@@ -171,7 +169,7 @@ def reconstruct(
             strict=strict,
         )
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
-        output = Output(out, linear, gamma, balance, unsure)
+        output = options.Output(out, linear, gamma, balance, unsure)
         jobs = plan_jobs(capture[0], sources, output, tuple(capture[1:]))
         end = run_with_bar(jobs, sources, recipe, output)
     if end:
@@ -208,12 +206,11 @@ def check(
     """
     with reported(lambda: "interrupted; nothing is known of the PSF"):
         from thincam_jax.commands.reconstruct import options
-        from thincam_jax.commands.reconstruct.options import Sources
         from thincam_jax.commands.reconstruct.run import check_files, enough_blocks
         from thincam_jax.commands.terminal import progress_bar
         from thincam_jax.measured import Preparation
 
-        sources = Sources(
+        sources = options.Sources(
             psf,
             options.read_background(background),
             options.read_background(psf_background),

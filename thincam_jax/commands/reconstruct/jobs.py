@@ -22,8 +22,6 @@ from thincam_jax.measured.preparation import Background as Level
 from thincam_jax.measured.read import image_files, pair_backgrounds
 from thincam_jax.measured.write import LINEAR
 
-_ROUNDED = 0.1  # relative difference of two statements of an exposure
-
 
 @dataclass(frozen=True)
 class Job:
@@ -83,16 +81,15 @@ class Rig:
                 )
         else:
             files = given if isinstance(given, tuple) else (given,)
-            paired = pair_backgrounds(files, of_psf)
-            psf, self.psf_background = self._read(files, paired, psf_bits, True)
-            self.psfs = [psf]
+            paired = files, pair_backgrounds(files, of_psf)
+            *self.psfs, self.psf_background = self._read(*paired, psf_bits, is_psf=True)
 
     def examine(self, job: Job) -> tuple[Examination, Level | None]:
         """Examination of a job's capture, and its background."""
         files = job.capture, *job.others
-        image, background = self._read(files, job.backgrounds, self.sources.bits, False)
-        found = examine([image], self.psfs[job.focus or 0], self.sources.preparation)
-        return found, background
+        image, background = self._read(files, job.backgrounds, self.sources.bits)
+        psf = self.psfs[job.focus or 0]
+        return examine([image], psf, self.sources.preparation), background
 
     def prepare(self, capture: Path) -> measured.Prepared:
         paired = tuple(pair_backgrounds([capture], self.sources.background))
@@ -114,20 +111,21 @@ class Rig:
 
     def _level(self, given: Background, bits: int | None) -> Level | None:
         """The background of all images; None of a folder, which has one for each."""
-        is_file = isinstance(given, Path) and not given.is_dir()
-        return self._dark(given, bits) if is_file else None if isinstance(given, Path) else given
+        if not isinstance(given, Path):
+            return given
+        return None if given.is_dir() else self._dark(given, bits)
 
     def _read(
-        self, files: Sequence[Path], paired: Sequence[Path], bits: int | None, is_psf: bool
+        self, files: Sequence[Path], dark: Sequence[Path], bits: int | None, is_psf: bool = False
     ) -> tuple[measured.Raw, Level | None]:
-        """One image, merged of its exposures, and its background; `paired`: that of each file."""
+        """One image, merged of its exposures, and its background; `dark`: of each file."""
         n, given = len(files), self.sources.exposures if len(files) > 1 else ()
         times = (given[:n] if is_psf else given[-n:]) or (None,) * n
         images = [self._image(*one, bits) for one in zip(files, times, strict=True)]
         level = self.psf_background if is_psf else self.background
         if is_psf and level is None and isinstance(self.background, measured.Raw):
             level = self.background if self.background.bits == images[0].bits else None
-        levels: list[Any] = [self._dark(path, bits) for path in paired] or [level] * n
+        levels: list[Any] = [self._dark(path, bits) for path in dark] or [level] * n
         for i, one in enumerate(levels):
             if isinstance(one, measured.Raw):
                 images[i], levels[i] = without_hot_pixels(images[i], one)
@@ -140,15 +138,14 @@ class Rig:
     def _image(self, path: Path, exposure: float | None, bits: int | None) -> measured.Raw:
         """An image with its exposure and the dead pixels of the map, where that has its size."""
         image = measured.read_image(path, bits)
-        said, dead = image.exposure or exposure, image.dead
-        if said and exposure and abs(said / exposure - 1) > _ROUNDED:
-            raise MeasurementError(
-                f"{path}: its exposure is {said:g} s by the file and {exposure:g} s by --exposure; "
-                "leave --exposure out, or remove the wrong tag"
+        said, size = image.exposure or exposure, image.pixels.shape[:2]
+        if said and exposure and abs(said / exposure - 1) > 0.1:  # more than rounded
+            text = (
+                f"{path}: its exposure is {said:g} s by the file and {exposure:g} s by --exposure"
             )
-        if self.dead is not None and self.dead.shape == image.pixels.shape[:2]:
-            dead = self.dead if dead is None else self.dead | dead
-        return replace(image, exposure=said, dead=dead)
+            raise MeasurementError(f"{text}; leave --exposure out, or remove the wrong tag")
+        maps = [one for one in (image.dead, self.dead) if one is not None and one.shape == size]
+        return replace(image, exposure=said, dead=np.any(maps, axis=0) if maps else None)
 
 
 def plan_jobs(
@@ -159,9 +156,9 @@ def plan_jobs(
     Files of the folder that `sources` names are no captures. Nothing is written yet, but whether
     something can be is tried.
 
-    **Errors**: MeasurementError, one line, for a folder without captures, that is also the output's
-    or one of several exposures, backgrounds that fit no captures, an output that cannot be written
-    or that would overwrite an input, and two captures of the same name.
+    **Errors**: MeasurementError, one line, for a folder without captures or that is also the
+    output's, backgrounds that do not pair, an output that cannot be written or that would overwrite
+    an input, and two captures of the same name.
     """
     batch = capture.is_dir() and not others
     captures = _captures_in(capture, sources) if batch else [capture]

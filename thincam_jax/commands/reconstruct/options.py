@@ -39,9 +39,9 @@ Background = Path | float | int | Literal["corner", "found"] | None
 class Sources:
     """Sources that all captures of a run share; see `measured.prepare`.
 
-    - `psf`: a file, several of one PSF at several exposures, or what `computed_psf` has made.
-      `dead`: a file. `background`, `psf_background`: a dark frame's file, a folder of one for each
-      capture (see `pair_backgrounds`), a number of counts, "corner", "found", or None: the default.
+    - `psf`: a file, files of its exposures, or what `computed_psf` has made. `dead`: a file.
+      `background`, `psf_background`: a dark frame's file, a folder (see `pair_backgrounds`), a
+      number of counts, "corner", "found", or None for the default.
     - `bits`: bit depth of the camera where its files do not tell it; `psf_bits` that of the PSF
       and its background where it is another.
     - `distances`: mm, increasing, of the PSFs that `psf` then holds, one for each; see
@@ -64,8 +64,7 @@ class Sources:
         psfs = self.psf if isinstance(self.psf, tuple) else (self.psf,)
         given = (*psfs, self.background, self.psf_background, self.dead)
         paths = [path for path in given if isinstance(path, Path)]
-        folders = [path for path in paths if path.is_dir()]
-        return paths + [file for folder in folders for file in image_files(folder)]
+        return paths + [file for path in paths if path.is_dir() for file in image_files(path)]
 
 
 @dataclass(frozen=True)
@@ -218,8 +217,7 @@ def known_psf(
 ) -> tuple[Path | Raw | tuple[Path, ...], Focusing | None]:
     """The files of a measured PSF; or the PSF of a camera, and its network.
 
-    **Errors**: MeasurementError where not one of PSF and camera is given; ConfigError of the camera
-    and the network.
+    **Errors**: MeasurementError where not one is given; ConfigError of the camera and the network.
     """
     if bool(psf) == (camera is not None):
         raise MeasurementError(
@@ -250,10 +248,9 @@ def read_exposures(texts: Sequence[str], *counts: int) -> tuple[float, ...]:
     except ValueError as error:
         raise MeasurementError(f"--exposure: {error}") from None
     if times and len(times) != sum(n for n in counts if n > 1):
-        raise MeasurementError(
-            f"--exposure is given {len(times)} times, for {counts[0]} --psf and {counts[1]} "
-            "--capture; give one for each of what is given several times, the PSF's first"
-        )
+        text = f"--exposure is given {len(times)} times, for {counts[0]} --psf and {counts[1]}"
+        text += " --capture; give one for each of what is given several times, the PSF's first"
+        raise MeasurementError(text)
     return times
 
 

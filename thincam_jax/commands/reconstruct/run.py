@@ -111,10 +111,8 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
     examined, background = rig.examine(job)
     known = background not in (None, "found") or examined.captures[0].black_level is not None
     if recipe.focusing is not None and not known:
-        raise measured.MeasurementError(
-            f"{job.capture}: a network finds no background, as solvers do; give --background, a "
-            "dark frame or a number of counts"
-        )
+        text = f"{job.capture}: a network finds no background, as solvers do; give --background, a"
+        raise measured.MeasurementError(f"{text} dark frame or a number of counts")
     ready = rig.ready(examined, background)
     _check_channels(job, ready, recipe, output)
     rig.tell(examined.findings, recipe.strict)
