@@ -5,13 +5,14 @@ import logging
 
 import numpy as np
 import PIL.Image
+import PIL.TiffImagePlugin
 import pytest
 import tifffile
 
 from thincam_jax.commands.reconstruct.options import Sources
 from thincam_jax.commands.reconstruct.run import Rig
 from thincam_jax.imaging.encoding import ORIENTATION, upright
-from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare, read_image
+from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare, read, read_image
 from thincam_jax.measured.bayer import colour_sites, mosaic
 
 SHAPE, BLACK, WHITE = (36, 52), 256, 4095
@@ -19,7 +20,7 @@ RNG = np.random.default_rng(0)
 COLOURS = RNG.uniform(100, 3000, (3, *SHAPE)) * np.array([1.0, 0.7, 0.3])[:, None, None]
 
 
-def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE):
+def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE, more=()):
     """A DNG 1.4 whose pixels lie as its orientation says."""
     inverse = {6: 8, 8: 6}.get(orientation, orientation)
     pixels = upright(np.rint(mosaic(light, pattern)).astype(np.uint16) + black, inverse)
@@ -37,6 +38,7 @@ def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE):
         (50728, 5, 3, (1,) * 6, True),
         (50778, 3, 1, 21, True),
         (ORIENTATION, 3, 1, orientation, True),
+        *more,
     ]
     stream = io.BytesIO()
     tifffile.imwrite(stream, np.ascontiguousarray(pixels), photometric=32803, extratags=tags)
@@ -159,3 +161,34 @@ def test_masked_arrays_and_infinite_values():
     for bad in (np.full(SHAPE, np.inf), np.full(SHAPE, np.nan)):
         with pytest.raises(MeasurementError, match="values are NaN or infinite; give finite ones"):
             Raw(bad)
+
+
+@pytest.mark.parametrize("suffix", ["tif", "exif.tif", "png", "jpg", "dng", "broken.tif"])
+@pytest.mark.filterwarnings("ignore::thincam_jax.measured.NonlinearWarning")
+def test_exposure(tmp_path, suffix):
+    """By TIFF's own tag and by EXIF; a number that is none is not taken."""
+    path, pixels = tmp_path / f"a.{suffix}", np.full(SHAPE, 1000, np.uint16)
+    eight, exif = PIL.Image.fromarray((pixels // 16).astype(np.uint8)), PIL.Image.Exif()
+    if suffix == "dng":
+        path.write_bytes(dng("RGGB", more=[(33434, 5, 1, (1, 250), True)]))
+    elif suffix in ("png", "jpg"):
+        exif[34665] = {33434: 0.004}
+        eight.save(path, exif=exif)
+    elif suffix == "exif.tif":
+        tags = PIL.TiffImagePlugin.ImageFileDirectory_v2()
+        tags.tagtype[34665], tags[34665] = 4, {33434: PIL.TiffImagePlugin.IFDRational(1, 250)}
+        eight.save(path, tiffinfo=tags)
+    else:
+        time = (1, 0) if suffix == "broken.tif" else (1, 250)
+        tifffile.imwrite(path, pixels, extratags=[(33434, 5, 1, time, True)])
+    expected = None if suffix == "broken.tif" else pytest.approx(4e-3)
+    assert read_image(path).exposure == expected
+
+
+@pytest.mark.parametrize("card", ["EXPTIME =                4E-3 / s", "EXPOSURE=  0.004"])
+def test_exposure_of_fits(monkeypatch, card):
+    """Of its header, whatever reads its array."""
+    header = b"".join(line.ljust(80).encode() for line in ("SIMPLE  =    T", card, "END"))
+    monkeypatch.setattr(read, "read_array", lambda kind, data, key: np.ones(SHAPE))
+    assert read._read_container("fits", None, header)[1] == {"exposure": 4e-3}
+    assert read._read_container("mat", None, header)[1] == {}

@@ -250,7 +250,12 @@ def test_backgrounds_that_do_not_belong():
     refused(r"dark frame .* has shape \(20, 36\)", grey, grey, Raw(measured()[:20], 12))
     refused("dark frame .* has 16 bit and the psf 12 bit", grey, grey, Raw(measured()))
     floats = Raw(measured().astype(float))
-    refused("PSF has an unknown full scale and the capture 12 bit.*same `bits`", floats, grey)
+    message = "PSF has an unknown full scale and the capture 12 bit.*same `bits`"
+    refused(message, floats, grey, "corner")
+    with pytest.warns(UserWarning, match="whose black may turn grey; a dark frame or a number"):
+        log = prepare(floats, grey).log  # each level is its own
+    prepare(floats, grey, 40.0)  # as it advises
+    assert (log.psf.background, log.capture.background) == ("corner", "found with the image")
     refused("background = nan: give a finite number", grey, grey, math.nan)
 
 

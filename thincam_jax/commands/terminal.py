@@ -4,6 +4,7 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 """
 
 import contextlib
+import functools
 import re
 import sys
 import warnings
@@ -40,7 +41,7 @@ DryRun = Annotated[
 def reported(interrupted: Callable[[], str]) -> Iterator[None]:
     """Report user errors in one line, and Ctrl-C by the text that `interrupted` gives.
 
-    Anything else is a defect and keeps its traceback. Python's warnings take a line each, too.
+    Anything else is a defect and keeps its traceback. Python's warnings take a line each, once.
     """
     from thincam_jax._core.files import MeasurementError
     from thincam_jax._core.jax_settings import cannot_start
@@ -48,7 +49,8 @@ def reported(interrupted: Callable[[], str]) -> Iterator[None]:
 
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = lambda message, *_, **__: warn([str(message)])
+            once = functools.cache(lambda text: warn([text]))
+            warnings.showwarning = lambda message, *_, **__: once(str(message))
             if fault := cannot_start():
                 raise ConfigError(fault)
             yield

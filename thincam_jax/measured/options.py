@@ -130,7 +130,9 @@ def by_files(
     if background is None or _is(background, "found"):
         background = "found" if levels[0] is None else levels[0]
         psf_background = "found" if psf_background is None else psf_background
-    psf_background = background if psf_background is None else psf_background
+    if psf_background is None:
+        none = isinstance(background, numbers.Real) and background == 0
+        psf_background = background if none or psf.bits == capture.bits else "found"
     if _is(psf_background, "found"):
         psf_background = next((level for level in levels[::-1] if level is not None), "found")
     for raw in (capture, psf):
@@ -234,10 +236,10 @@ def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
                 f"background = {background!r}: give a dark frame, a number of counts, 'corner' or "
                 "'found'"
             )
-        if raw.bits != psf.bits:
+        if background == "corner" and raw.bits != psf.bits:
             raise MeasurementError(
                 f"the PSF has {_scale(psf)} and the {name} {_scale(raw)}, so the PSF's corner says "
-                "nothing about it; read both with the same `bits`, or give its background"
+                "nothing about it; read both with the same `bits`, or give 'found'"
             )
     elif not isinstance(background, SensorCalibration) and not np.isfinite(background):
         raise MeasurementError(f"background = {background!r}: give a finite number of counts")

@@ -77,8 +77,8 @@ def prepare(
        and nothing for the capture, whose uniform background is then found with the image.
        "corner": the mean of a square in the PSF's upper left corner, untested, for both. A
        `SensorCalibration` `at` the image's exposure also divides by the response of each pixel and
-       gives the variance. `psf_background` is that of the PSF where it differs. Negative values
-       become 0.
+       gives the variance. `psf_background` is that of the PSF where it differs; a PSF of another
+       bit depth has its own, given or found. Negative values become 0.
     3. Saturated pixels (before the subtraction), `dead` ones, True in a map (y, x) of the sensor
        (`read_mask`), and defective ones by the calibration are not valid.
     4. Demosaicing, if the options name a Bayer pattern; then the capture's `crop`.
@@ -162,7 +162,12 @@ def _found(planes, backgrounds: dict[str, Background], raws, options: Preparatio
     if not sought:
         side = slice(*options.corner)
         return corner_levels(planes, (slice(None), side, side))
-    found = find_levels(planes, options.corner, options.bayer)
+    comparable = raws["psf"].bits == raws["capture"].bits
+    seen = planes if comparable else {"psf": planes["psf"]}
+    found = find_levels(seen, options.corner, options.bayer)
+    if "capture" in sought and not comparable:
+        text = "its background is found with the image, whose black may turn grey; a dark frame or"
+        warnings.warn(f"{raws['capture'].name}: {text} a number of counts is better", stacklevel=4)
     if "psf" in sought and found.sources["psf"] != "corner":
         warnings.warn(
             f"no corner of the PSF ({raws['psf'].name}) is dark: its lowest value is taken as its "

@@ -32,7 +32,8 @@ class Raw:
     - `sensor_shape`: of a PSF that was computed also beyond the sensor, that of the sensor.
     - `bayer`, `black_level`, `white_level`: as its file says them, counts; None where it does not.
       The white level is then the full scale.
-    - `saturation`: count from which pixels are saturated, where that is below full scale.
+    - `exposure`: s, by its file. `saturation`: count from which pixels are saturated, where that is
+      below full scale.
     - `dead`: map (y, x) of pixels that are NaN or masked; they are 0 in `pixels`. None: no such.
 
     **Errors**: MeasurementError for another shape or type, an empty image, infinite values, no
@@ -50,6 +51,7 @@ class Raw:
     white_level: int | None = None
     dead: Bool[np.ndarray, "y x"] | None = field(default=None, repr=False)
     saturation: float | None = None
+    exposure: float | None = None
 
     def __post_init__(self):
         try:

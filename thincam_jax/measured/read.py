@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ _PLAIN = (
     tifffile.PHOTOMETRIC.LINEAR_RAW,
 )
 _UNDAMAGED = "give an undamaged TIFF, PNG, JPEG or NPY file"
+_EXIF, _EXPOSURE_TIME = 34665, 33434  # tags
 _FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  # orientations by LibRaw
 _NONLINEAR = (
     "a JPEG's counts are not in proportion to the light (gamma, tone curve, compression), so that "
@@ -73,7 +74,8 @@ def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     read with a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files
     of cameras need the extra `raw`; they give their mosaic (y, x) with the black level in it, and
     what the file says of it: pattern, black and white level. Images are turned upright, and their
-    pattern with them, as their orientation (EXIF, TIFF) says. NaN are dead pixels.
+    pattern with them, as their orientation (EXIF, TIFF) says. NaN are dead pixels. The exposure
+    time is that of EXIF, TIFF or FITS.
 
     **Errors**: CaptureFileError, one line, for a file that is missing, truncated, damaged or no
     image, for a stack of images, and for everything that `Raw` refuses.
@@ -171,6 +173,23 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
     return sorted(paths, key=_order)
 
 
+def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
+    """List the background of each capture: that of its name, or all in order; none of no folder.
+
+    **Errors**: CaptureFileError where only some names agree, or none does and the counts differ.
+    """
+    if not (isinstance(folder, Path) and folder.is_dir()):
+        return []
+    named = {path.stem: path for path in image_files(folder)}
+    alike = [named[capture.stem] for capture in captures if capture.stem in named]
+    if len(captures) not in (len(alike), len(named)) or 0 < len(alike) < len(captures):
+        raise CaptureFileError(
+            f"{folder}: holds {len(named)} backgrounds for {len(captures)} captures, {len(alike)} "
+            "named as one; name all as their captures, give as many, or one file for all"
+        )
+    return alike or list(named.values())
+
+
 def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
@@ -241,7 +260,18 @@ def _kind(path: Path) -> str:
 
 
 def _read_container(kind: str, key: str | None, data: bytes) -> tuple[list[np.ndarray], _Facts]:
-    return [read_array(kind, data, key)], {}
+    time = re.search(rb"EXP(?:TIME|OSURE) *= *([0-9.Ee+-]+)", data[:28800])  # of FITS, s
+    facts = _exposure(time[1].decode()) if kind == "fits" and time else {}
+    return [read_array(kind, data, key)], facts
+
+
+def _exposure(*given: Any) -> _Facts:
+    """The first exposure time, s, that is a number above 0; TIFF has (numerator, denominator)."""
+    for one in given:
+        with contextlib.suppress(TypeError, ValueError, ZeroDivisionError):
+            if 0 < (time := float(one[0] / one[1] if isinstance(one, tuple) else one)) < np.inf:
+                return {"exposure": time}
+    return {}
 
 
 def _read_npy(data: bytes) -> tuple[list[np.ndarray], _Facts]:
@@ -262,7 +292,7 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], _Facts]:
         raise CaptureFileError(f"has {depth} bit a sample; 8 to 16 are read")
     if b"acTL" in data[: data.find(b"IDAT")]:
         raise CaptureFileError("is animated; give one image a file")
-    stored, orientation = _by_pillow(data)
+    stored, facts = _by_pillow(data)
     if depth == 16 and colour:  # of which Pillow keeps 8 bits
         import imagecodecs
 
@@ -270,13 +300,15 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], _Facts]:
     else:
         pixels = stored.astype(f"uint{depth}", copy=False)
     pixels = _without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))
-    return [pixels], {"bits": depth, "orientation": orientation}
+    return [pixels], {"bits": depth, **facts}
 
 
-def _by_pillow(data: bytes) -> tuple[np.ndarray, int]:
-    """Pixels as they are stored, and their orientation."""
+def _by_pillow(data: bytes) -> tuple[np.ndarray, _Facts]:
+    """Pixels as they are stored, their orientation and exposure."""
     with PIL.Image.open(io.BytesIO(data)) as file:
-        return np.array(file), file.getexif().get(ORIENTATION, 1)
+        exif = file.getexif()
+        time = exif.get_ifd(_EXIF).get(_EXPOSURE_TIME)
+        return np.array(file), {"orientation": exif.get(ORIENTATION, 1), **_exposure(time)}
 
 
 def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
@@ -295,6 +327,7 @@ def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
         sites = [letters[n] for n in file.raw_colors_visible[:2, :2].ravel()]
         sites = "".join(sites) if np.asarray(file.raw_pattern).size == 4 else ""
         facts = _sensor_facts(sites, file.black_level_per_channel, [int(file.white_level)])
+        facts |= _exposure(getattr(getattr(file, "other", None), "shutter_speed", None))
         return [pixels], {"bits": 16, **facts, "orientation": _FLIPS[file.sizes.flip]}
 
 
@@ -307,8 +340,8 @@ def _sensor_facts(sites: str, black: Any, white: Any) -> _Facts:
 
 
 def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], _Facts]:
-    pixels, orientation = _by_pillow(data)
-    return [pixels], {"bits": 8, "orientation": orientation}
+    pixels, facts = _by_pillow(data)
+    return [pixels], {"bits": 8, **facts}
 
 
 def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], _Facts]:
@@ -322,6 +355,8 @@ def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], _Facts]:
 def _tiff_facts(page: tifffile.TiffPage) -> _Facts:
     """By the tags of TIFF and DNG."""
     bits, facts = page.bitspersample, {"orientation": page.tags.valueof(ORIENTATION, 1)}
+    exif = page.tags.valueof(_EXIF, {}) or {}
+    facts |= _exposure(exif.get("ExposureTime"), page.tags.valueof(_EXPOSURE_TIME))
     if page.dtype is not None and page.dtype.kind == "u" and isinstance(bits, int):
         facts |= {"bits": bits} if 8 <= bits <= 16 else {}
     if page.photometric != tifffile.PHOTOMETRIC.CFA:

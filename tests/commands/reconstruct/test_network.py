@@ -62,5 +62,9 @@ def test_what_does_not_fit_is_one_line(files):
         ),
         ((call(files, "--network", files / "capture.tif")), "is no file of a network"),
         ((call(files, "--psf", files / "capture.tif")), "give either --psf"),
+        (
+            (call(files, "--background", "found")),
+            "a network finds no background, as solvers do; give",
+        ),
     ):
         assert message in one_line(given)

@@ -14,7 +14,7 @@ METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
 
 Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
 Background = Annotated[
-    str | None, Option(help="Dark frame, or a number of counts. Default: a corner of the PSF.")
+    str | None, Option(help="Dark frame, a folder of one each, counts, corner or (default) found.")
 ]
 PsfBackground = Annotated[
     str | None, Option(help="That of the PSF, where it was exposed otherwise.")
@@ -42,11 +42,14 @@ Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where de
 
 
 def reconstruct(
-    capture: Annotated[Path, Option(help="Capture of the same size; or a folder of captures.")],
+    capture: Annotated[list[Path], Option(help="Capture, or a folder; several: its exposures.")],
     out: Annotated[
         Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
     ],
-    psf: Annotated[Path | None, Option(help="Measured PSF: TIFF, PNG or NPY.")] = None,
+    psf: Annotated[list[Path] | None, Option(help="Measured PSF; several: its exposures.")] = None,
+    exposure: Annotated[
+        list[str] | None, Option(help="As 4ms, of each exposure whose file does not say it.")
+    ] = None,
     distances: Annotated[
         str | None,
         Option(help="60mm,80mm,100mm: refocus; --psf is a folder or TIFF of a PSF for each."),
@@ -128,13 +131,11 @@ def reconstruct(
     with reported(lambda: nothing):
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
-        from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
         from thincam_jax.commands.reconstruct.run import run_with_bar
         from thincam_jax.measured import Preparation
 
-        given = psf, camera, set_, network, distance, background
-        known, focusing = options.known_psf(*given)
-        sources = Sources(
+        known, focusing = options.known_psf(psf or (), camera, set_, network, distance)
+        sources = options.Sources(
             known,
             options.read_background(background),
             0.0 if camera else options.read_background(psf_background),
@@ -152,9 +153,10 @@ def reconstruct(
                 psf_channels=psf_channels,
             ),
             psf_bits,
-            options.read_distances(distances, psf),
+            options.read_distances(distances, psf or ()),
+            options.read_exposures(exposure or (), len(psf or ()), len(capture)),
         )
-        recipe = Recipe(
+        recipe = options.Recipe(
             method=method.replace("-", "_"),
             tau=tau,
             iterations=iterations,
@@ -167,8 +169,9 @@ def reconstruct(
             strict=strict,
         )
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
-        output = Output(out, linear, gamma, balance, unsure)
-        end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
+        output = options.Output(out, linear, gamma, balance, unsure)
+        jobs = plan_jobs(capture[0], sources, output, tuple(capture[1:]))
+        end = run_with_bar(jobs, sources, recipe, output)
     if end:
         raise typer.Exit(end)
 
@@ -203,12 +206,11 @@ def check(
     """
     with reported(lambda: "interrupted; nothing is known of the PSF"):
         from thincam_jax.commands.reconstruct import options
-        from thincam_jax.commands.reconstruct.options import Sources
         from thincam_jax.commands.reconstruct.run import check_files, enough_blocks
         from thincam_jax.commands.terminal import progress_bar
         from thincam_jax.measured import Preparation
 
-        sources = Sources(
+        sources = options.Sources(
             psf,
             options.read_background(background),
             options.read_background(psf_background),

@@ -1,18 +1,25 @@
-"""Plan which captures are reconstructed into which files, checked before any work."""
+"""Jobs: which captures become which files, checked before any work, and what each is made of."""
 
+import functools
 import os
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from thincam_jax import measured
 from thincam_jax._core.files import write_whole, writing
-from thincam_jax.commands.reconstruct.options import Output, Sources
+from thincam_jax.commands import terminal
+from thincam_jax.commands.reconstruct.options import Background, Output, Sources
 from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
-from thincam_jax.measured.read import image_files
+from thincam_jax.measured.dark import without_hot_pixels
+from thincam_jax.measured.examination import Examination, Finding, examine
+from thincam_jax.measured.merging import merge_images
+from thincam_jax.measured.preparation import Background as Level
+from thincam_jax.measured.read import image_files, pair_backgrounds
 from thincam_jax.measured.write import LINEAR
 
 
@@ -24,6 +31,7 @@ class Job:
       image that is sharp everywhere.
     - `label`: that distance, for messages.
     - `beside`: further files.
+    - `others`: further exposures of the capture. `backgrounds`: of each, where they differ.
     """
 
     capture: Path
@@ -31,6 +39,8 @@ class Job:
     focus: int | None = 0
     label: str = ""
     beside: tuple[Path, ...] = ()
+    others: tuple[Path, ...] = ()
+    backgrounds: tuple[Path, ...] = ()
 
     @property
     def name(self) -> str:
@@ -46,17 +56,111 @@ class Job:
         return self.images[0].suffix.lower() == ".png"
 
 
-def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
-    """Jobs for a capture, or for each capture in a folder.
+class Rig:
+    """`Sources`, read once."""
+
+    def __init__(self, sources: Sources):
+        self.sources, self.warned = sources, set[str]()
+        self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
+        self._dark = functools.lru_cache(8)(measured.read_image)
+        psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
+        given, of_psf = sources.psf, sources.psf_background
+        self.background = self._level(sources.background, sources.bits)
+        if of_psf is None and self.background is None and sources.background is not None:
+            of_psf = "found"  # a folder is of the captures
+        self.psf_background = self._level(of_psf, psf_bits)
+        if isinstance(given, measured.Raw):
+            self.psfs = [given]
+        elif sources.distances:
+            assert isinstance(given, Path)
+            self.psfs = measured.read_images(given, psf_bits)
+            if len(self.psfs) != len(sources.distances):
+                raise MeasurementError(
+                    f"{given}: holds {len(self.psfs)} PSFs for {len(sources.distances)} distances; "
+                    "give one for each, nearest first"
+                )
+        else:
+            files = given if isinstance(given, tuple) else (given,)
+            paired = files, pair_backgrounds(files, of_psf)
+            *self.psfs, self.psf_background = self._read(*paired, psf_bits, is_psf=True)
+
+    def examine(self, job: Job) -> tuple[Examination, Level | None]:
+        """Examination of a job's capture, and its background."""
+        files = job.capture, *job.others
+        image, background = self._read(files, job.backgrounds, self.sources.bits)
+        psf = self.psfs[job.focus or 0]
+        return examine([image], psf, self.sources.preparation), background
+
+    def prepare(self, capture: Path) -> measured.Prepared:
+        paired = tuple(pair_backgrounds([capture], self.sources.background))
+        return self.ready(*self.examine(Job(capture, (), backgrounds=paired)))
+
+    def ready(self, examined: Examination, background: Level | None) -> measured.Prepared:
+        psf, (image,) = examined.psf, examined.captures
+        assert psf is not None
+        known = {"psf_background": self.psf_background, "dead": self.dead}
+        return measured.prepare(psf, image, background, self.sources.preparation, **known)
+
+    def tell(self, findings: Sequence[Finding], strict: bool) -> None:
+        """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
+        lines = [str(one) for one in findings]
+        terminal.warn([line for line in lines if line not in self.warned])
+        self.warned.update(lines)
+        if bad := [str(one) for one in findings if strict and one.severe]:
+            raise MeasurementError(f"{bad[0]} (an error by --strict)")
+
+    def _level(self, given: Background, bits: int | None) -> Level | None:
+        """The background of all images; None of a folder, which has one for each."""
+        if not isinstance(given, Path):
+            return given
+        return None if given.is_dir() else self._dark(given, bits)
+
+    def _read(
+        self, files: Sequence[Path], dark: Sequence[Path], bits: int | None, is_psf: bool = False
+    ) -> tuple[measured.Raw, Level | None]:
+        """One image, merged of its exposures, and its background; `dark`: of each file."""
+        n, given = len(files), self.sources.exposures if len(files) > 1 else ()
+        times = (given[:n] if is_psf else given[-n:]) or (None,) * n
+        images = [self._image(*one, bits) for one in zip(files, times, strict=True)]
+        level = self.psf_background if is_psf else self.background
+        if is_psf and level is None and isinstance(self.background, measured.Raw):
+            level = self.background if self.background.bits == images[0].bits else None
+        levels: list[Any] = [self._dark(path, bits) for path in dark] or [level] * n
+        for i, one in enumerate(levels):
+            if isinstance(one, measured.Raw):
+                images[i], levels[i] = without_hot_pixels(images[i], one)
+        if n == 1:
+            return images[0], levels[0]
+        known = None if levels[0] in (None, "corner", "found") else levels
+        merged = merge_images(images, known, self.sources.preparation.saturation)
+        return merged, merged.black_level
+
+    def _image(self, path: Path, exposure: float | None, bits: int | None) -> measured.Raw:
+        """An image with its exposure and the dead pixels of the map, where that has its size."""
+        image = measured.read_image(path, bits)
+        said, size = image.exposure or exposure, image.pixels.shape[:2]
+        if said and exposure and abs(said / exposure - 1) > 0.1:  # more than rounded
+            text = (
+                f"{path}: its exposure is {said:g} s by the file and {exposure:g} s by --exposure"
+            )
+            raise MeasurementError(f"{text}; leave --exposure out, or remove the wrong tag")
+        maps = [one for one in (image.dead, self.dead) if one is not None and one.shape == size]
+        return replace(image, exposure=said, dead=np.any(maps, axis=0) if maps else None)
+
+
+def plan_jobs(
+    capture: Path, sources: Sources, output: Output, others: tuple[Path, ...] = ()
+) -> list[Job]:
+    """Jobs for a capture and `others`, its further exposures, or for each capture in a folder.
 
     Files of the folder that `sources` names are no captures. Nothing is written yet, but whether
     something can be is tried.
 
     **Errors**: MeasurementError, one line, for a folder without captures or that is also the
-    output's, an output that cannot be written or that would overwrite an input, and two captures of
-    the same name.
+    output's, backgrounds that do not pair, an output that cannot be written or that would overwrite
+    an input, and two captures of the same name.
     """
-    batch = capture.is_dir()
+    batch = capture.is_dir() and not others
     captures = _captures_in(capture, sources) if batch else [capture]
     folder = output.path if batch or output.path.is_dir() else output.path.parent
     if batch:
@@ -64,6 +168,9 @@ def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
     names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
     planned = zip(captures, names, strict=True)
     jobs = [job for c, n in planned for job in _jobs_of(c, n, sources, output)]
+    found = pair_backgrounds([*captures, *others], sources.background)
+    pairs = {c: tuple(found) if others else (b,) for c, b in zip(captures, found, strict=False)}
+    jobs = [replace(j, others=others, backgrounds=pairs.get(j.capture, ())) for j in jobs]
     _check_names(jobs, sources)
     _check_writable(folder)
     return jobs
@@ -137,7 +244,7 @@ def _check_batch_folder(captures: Path, folder: Path) -> None:
 
 
 def _check_names(jobs: list[Job], sources: Sources) -> None:
-    read = (*sources.paths(), *(job.capture for job in jobs))
+    read = (*sources.paths(), *(path for job in jobs for path in (job.capture, *job.others)))
     inputs = {os.path.realpath(path) for path in read}  # also of links in a circle
     taken: dict[Path, Path] = {}
     for job in jobs:

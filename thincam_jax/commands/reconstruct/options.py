@@ -32,22 +32,24 @@ DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 # Far beyond any use; its product with the captures' units stays within float32.
 _LARGEST_TAU = 1e6
 
-Background = Path | float | int | None
+Background = Path | float | int | Literal["corner", "found"] | None
 
 
 @dataclass(frozen=True)
 class Sources:
     """Sources that all captures of a run share; see `measured.prepare`.
 
-    - `psf`: a file, or what `computed_psf` has made. `dead`: a file. `background`,
-      `psf_background`: a dark frame's file, a number of counts, or None for the default.
+    - `psf`: a file, files of its exposures, or what `computed_psf` has made. `dead`: a file.
+      `background`, `psf_background`: a dark frame's file, a folder (see `pair_backgrounds`), a
+      number of counts, "corner", "found", or None for the default.
     - `bits`: bit depth of the camera where its files do not tell it; `psf_bits` that of the PSF
       and its background where it is another.
     - `distances`: mm, increasing, of the PSFs that `psf` then holds, one for each; see
       `measured.read_images`. Without, it is one PSF.
+    - `exposures`: s, of the PSF's files, then a capture's, where these do not say them.
     """
 
-    psf: Path | Raw
+    psf: Path | Raw | tuple[Path, ...]
     background: Background = None
     psf_background: Background = None
     dead: Path | None = None
@@ -55,12 +57,14 @@ class Sources:
     preparation: Preparation = Preparation()
     psf_bits: int | None = None
     distances: tuple[float, ...] = ()
+    exposures: tuple[float, ...] = ()
 
     def paths(self) -> list[Path]:
-        """Every file that is read."""
-        given = (self.psf, self.background, self.psf_background, self.dead)
+        """Every file that is read, also those of folders."""
+        psfs = self.psf if isinstance(self.psf, tuple) else (self.psf,)
+        given = (*psfs, self.background, self.psf_background, self.dead)
         paths = [path for path in given if isinstance(path, Path)]
-        return paths + (image_files(paths[0]) if self.distances and paths[0].is_dir() else [])
+        return paths + [file for path in paths if path.is_dir() for file in image_files(path)]
 
 
 @dataclass(frozen=True)
@@ -195,9 +199,9 @@ class Output:
 
 
 def read_background(text: str | None) -> Background:
-    """A dark frame's path, or a number of counts."""
-    if text is None:
-        return None
+    """A path, a number of counts, "corner" or "found"."""
+    if text is None or text == "corner" or text == "found":
+        return text
     try:
         return float(text)
     except ValueError:
@@ -205,30 +209,28 @@ def read_background(text: str | None) -> Background:
 
 
 def known_psf(
-    psf: Path | None,
+    psf: Sequence[Path],
     camera: Path | None,
     overrides: list[str] | None,
     network: Path | None,
     distance: str | None,
-    background: str | None,
-) -> tuple[Path | Raw, Focusing | None]:
-    """The file of a measured PSF; or the PSF of a camera, and its network.
+) -> tuple[Path | Raw | tuple[Path, ...], Focusing | None]:
+    """The files of a measured PSF; or the PSF of a camera, and its network.
 
-    **Errors**: MeasurementError where not one of PSF and camera is given, and where a computed PSF
-    comes without a background; ConfigError of the camera and the network.
+    **Errors**: MeasurementError where not one is given; ConfigError of the camera and the network.
     """
-    if (psf is None) == (camera is None):
+    if bool(psf) == (camera is not None):
         raise MeasurementError(
             "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
         )
     if distance is not None and network is None:
         raise MeasurementError("--distance is that of a --network; see --distances for others")
-    if psf is not None:
+    if psf:
         if overrides:
             raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
         if network is not None:
             raise MeasurementError("--network is of a camera; give --camera in place of --psf")
-        return psf, None
+        return psf[0] if len(psf) == 1 else tuple(psf), None
     assert camera is not None
     try:
         focused = None if distance is None else parse_quantity(distance, "length")
@@ -236,23 +238,33 @@ def known_psf(
         raise MeasurementError(f"--distance: {error}") from None
     cameras = read_camera(camera, overrides or (), focused)
     focusing = None if network is None else read_network(network, cameras)
-    if background is None:
-        raise MeasurementError(
-            "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
-            "number of counts"
-        )
     return computed_psf(cameras, f"camera of {camera}"), focusing
 
 
-def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:
+def read_exposures(texts: Sequence[str], *counts: int) -> tuple[float, ...]:
+    """Exposures, s, of so many files of PSF and capture; MeasurementError for another number."""
+    try:
+        times = tuple(parse_quantity(text, "time") for text in texts)
+    except ValueError as error:
+        raise MeasurementError(f"--exposure: {error}") from None
+    if times and len(times) != sum(n for n in counts if n > 1):
+        text = f"--exposure is given {len(times)} times, for {counts[0]} --psf and {counts[1]}"
+        text += " --capture; give one for each of what is given several times, the PSF's first"
+        raise MeasurementError(text)
+    return times
+
+
+def read_distances(text: str | None, psf: Sequence[Path]) -> tuple[float, ...]:
     """Distances of measured PSFs, mm, from "60mm,80mm,100mm".
 
-    **Errors**: MeasurementError where they are none, not increasing, or there is no measured PSF.
+    **Errors**: MeasurementError where they are none, not increasing, or not of one --psf.
     """
     if text is None:
         return ()
-    if psf is None:
-        raise MeasurementError("--distances are those of measured PSFs; give them by --psf")
+    if len(psf) != 1:
+        raise MeasurementError(
+            "--distances are those of measured PSFs; give them by one --psf, a folder or a TIFF"
+        )
     try:
         distances = increasing([parse_quantity(part, "length") for part in text.split(",")])
     except ValueError as error:

@@ -16,10 +16,10 @@ from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.interrupt import INTERRUPTED
-from thincam_jax.commands.reconstruct.jobs import Job, write_job
-from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
+from thincam_jax.commands.reconstruct.jobs import Job, Rig, write_job
+from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
-from thincam_jax.measured.examination import Examination, Finding, examine, finding
+from thincam_jax.measured.examination import Finding, finding
 from thincam_jax.measured.write import LINEAR, linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver, refine
 from thincam_jax.reconstruction.depth import depth_of_colours
@@ -107,59 +107,14 @@ def run_jobs(
             return
 
 
-class Rig:
-    """`Sources`, read once."""
-
-    def __init__(self, sources: Sources):
-        self.sources = sources
-        psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
-        given = sources.psf
-        if isinstance(given, measured.Raw):
-            self.psfs = [given]
-        elif sources.distances:
-            self.psfs = measured.read_images(given, psf_bits)
-            if len(self.psfs) != len(sources.distances):
-                raise measured.MeasurementError(
-                    f"{given}: holds {len(self.psfs)} PSFs for {len(sources.distances)} distances; "
-                    "give one for each, nearest first"
-                )
-        else:
-            self.psfs = [measured.read_image(given, psf_bits)]
-        self.background = _background(sources.background, sources.bits)
-        self.psf_background = _background(sources.psf_background, psf_bits)
-        self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
-        self.warned: set[str] = set()
-
-    def examine(self, capture: Path, focus: int = 0) -> Examination:
-        image = measured.read_image(capture, self.sources.bits)
-        return examine([image], self.psfs[focus], self.sources.preparation)
-
-    def prepare(self, capture: Path, focus: int = 0) -> measured.Prepared:
-        return self.ready(self.examine(capture, focus))
-
-    def ready(self, examined: Examination) -> measured.Prepared:
-        psf, (image,) = examined.psf, examined.captures
-        assert psf is not None
-        known = {"psf_background": self.psf_background, "dead": self.dead}
-        return measured.prepare(psf, image, self.background, self.sources.preparation, **known)
-
-    def tell(self, findings: Sequence[Finding], strict: bool) -> None:
-        """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
-        lines = [str(one) for one in findings]
-        terminal.warn([line for line in lines if line not in self.warned])
-        self.warned.update(lines)
-        if bad := [str(one) for one in findings if strict and one.severe]:
-            raise measured.MeasurementError(f"{bad[0]} (an error by --strict)")
-
-
-def _background(given: Background, bits: int | None) -> measured.Raw | float | None:
-    return measured.read_image(given, bits) if isinstance(given, Path) else given
-
-
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report | None) -> Finished:
     began = time.perf_counter()
-    examined = rig.examine(job.capture, job.focus or 0)
-    ready = rig.ready(examined)
+    examined, background = rig.examine(job)
+    known = background not in (None, "found") or examined.captures[0].black_level is not None
+    if recipe.focusing is not None and not known:
+        text = f"{job.capture}: a network finds no background, as solvers do; give --background, a"
+        raise measured.MeasurementError(f"{text} dark frame or a number of counts")
+    ready = rig.ready(examined, background)
     _check_channels(job, ready, recipe, output)
     rig.tell(examined.findings, recipe.strict)
     noise = pixel_noise(ready, recipe.noise)
@@ -167,12 +122,13 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
         made = _reconstruct(job, ready, recipe, noise, report)
     else:
         made = _focus(job, ready, recipe.focusing, noise)
+    rig.tell(() if made.doubt and not recipe.strict else made.findings, recipe.strict)
     findings = (*examined.findings, *made.findings)
-    rig.tell(() if made.doubt and not recipe.strict else findings, recipe.strict)
     image = made.image[:, ::-1, ::-1] if recipe.flip else made.image
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
     record = {
         "capture": job.capture,
+        **({"exposures": [job.capture, *job.others]} if job.others else {}),
         "sources": _source_facts(rig.sources),
         "preparation": asdict(ready.log),
         "examination": [asdict(one) for one in findings],
