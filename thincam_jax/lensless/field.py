@@ -151,7 +151,7 @@ def _averages(
 def tangents_of(
     camera: LenslessCamera, field_shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " n"]]:
-    """Tangents of the angles of the field's rows and columns, for rays through the mask's origin."""
+    """Tangents of the angles of the field's rows and columns, of rays through the mask's origin."""
     step = float(camera.sensor.pitch) / float(camera.distance)
     rows, columns = ((np.arange(n) - (n - 1) / 2) * step for n in field_shape)
     return rows, columns

@@ -80,7 +80,7 @@ def _count(reach: int) -> int:
 
 
 def _sum_before(values: np.ndarray, reach: int) -> np.ndarray:
-    """Sum over the pixels before each, within a reach: rows above and in its row, (*batch, y, x)."""
+    """Sum over the pixels before each, within a reach: above and in its row, (*batch, y, x)."""
     wide = (2 * reach + 1) * scipy.ndimage.uniform_filter1d(values, 2 * reach + 1, mode="nearest")
     return _sum_of_last(wide, reach, -2) + _sum_of_last(values, reach, -1)
 
