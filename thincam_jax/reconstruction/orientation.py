@@ -51,7 +51,7 @@ def _mirrored(problem: InverseProblem, axes: tuple[int, ...]) -> InverseProblem:
 
 
 def _mirrored_spectrum(spectrum: Complex[Array, "..."], axes: tuple[int, ...]) -> jax.Array:
-    """Of the mirrored kernel; of a real one that is mirrored along both axes, the conjugate."""
+    """Spectrum of the mirrored kernel: for a real one mirrored along both axes the conjugate."""
     if len(axes) == 2:
         return jnp.conj(spectrum)
     turned = jnp.roll(jnp.flip(spectrum, -2), 1, -2)

@@ -59,8 +59,7 @@ class Plan:
     - `level`: weight, mm, that counts as 1: the mean over pixels of the sum over all orders.
     - `shares`: errors of the single decisions. `simpler`: predicted ones of `separable`, and of
       `shift-invariant`: a convolution, with the ghosts of the sensor's middle everywhere.
-    - `crosstalk`: argument of `colour_system`, for a `ColourCamera`; `level` then has one for each
-      channel.
+    - `crosstalk`: argument of `colour_system`, for a `ColourCamera`; `level` then has several.
     """
 
     camera: SeeThroughCamera | ColourCamera
