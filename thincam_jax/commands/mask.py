@@ -105,10 +105,10 @@ class MaskConfig(
     - `cell`: side of a cell or of a lens. Arrays have the `width` of their cells.
     - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose code
       and itself `combine`; `tiles`: how often an array is repeated along each axis.
-    - `seed`: seed of what is random; `focal_length`, `lenses` (down, across): lenses of "lenslets".
+    - `seed`: seed of what is random; `focal_length`, `lenses` (down, across): for "lenslets".
     - `path`: path of a grey image, a "file", whose pixels make up the `width`; of a "phase", rad in
       a .npy or parts of a turn in an image.
-    - `correlation_length`, `rms_slope`: heights of a "diffuser"; `sites`: lenses of
+    - `correlation_length`, `rms_slope`: scale and slope of a "diffuser"; `sites`: lenses of
       "voronoi_fresnel", made for the wavelength; `feature`, `line_width`: size of the "contours"
       that are the PSF far away, at the wavelength and distance of the first shot. `index`:
       refractive index of all three, whose PSFs are by "angular_spectrum".

@@ -150,7 +150,7 @@ class MaskSetting(eqx.Module):
 
     - `sensor`, `distance`: mask to sensor, mm. `wavelengths`, `object_distances`: mm.
     - `together`: the sensor sees all wavelengths as one grey image; else each has its own.
-    - `field_shape`: samples of the scene on the sensor's pitch, at most 2048 along a side: what
+    - `field_shape`: rows and columns of the scene on the sensor's pitch, at most 2048 samples: what
       falls beside the sensor is lost. None takes the sensor's rims to meet.
     """
 

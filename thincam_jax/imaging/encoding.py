@@ -65,7 +65,7 @@ def say_once() -> None:
 
 
 def _by_profile(codes: np.ndarray, profile: bytes) -> np.ndarray:
-    """Light of codes by a profile's curve of red or grey (ICC.1, 10.6 and 10.18)."""
+    """Light of codes, by a profile's curve of red or grey (ICC.1, 10.6 and 10.18)."""
     (count,) = struct.unpack_from(">I", profile, 128)
     places = range(132, 132 + 12 * min(count, _MOST_TAGS), 12)
     tags = {profile[p : p + 4]: struct.unpack_from(">II", profile, p + 4) for p in places}

@@ -47,8 +47,8 @@ class TrainingOptions:
     - `rate`: step size of Adam; it rises over `warm_up` steps and falls to zero as a cosine, over
       the last `falling` part of the steps.
     - `longest_slope`: norm to which longer gradients are shortened.
-    - `averaging`: constant of the weights that are judged and kept, a running mean of the weights
-      over some 1/(1 − averaging) steps; 0: the weights themselves.
+    - `averaging`: decay of the running mean of the weights, which is judged and kept, over some
+      1/(1 − averaging) steps; 0: the weights themselves.
     - `check_every`: steps between two states that are judged and kept.
 
     **Errors**: ValueError for numbers out of range.

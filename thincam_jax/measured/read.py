@@ -320,7 +320,7 @@ def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], _Facts]:
 
 
 def _tiff_facts(page: tifffile.TiffPage) -> _Facts:
-    """Facts about the sensor by the tags of TIFF and DNG."""
+    """Facts about an image by the tags of TIFF and DNG."""
     bits, facts = page.bitspersample, {"orientation": page.tags.valueof(ORIENTATION, 1)}
     if page.dtype is not None and page.dtype.kind == "u" and isinstance(bits, int):
         facts |= {"bits": bits} if 8 <= bits <= 16 else {}

@@ -57,7 +57,7 @@ class Progress:
 class Outcome(eqx.Module):
     """The image with the lowest objective among those checked, and the history of the run.
 
-    - `reason`: reason that the user should know for this end; "" for none.
+    - `reason`: note about the result for the user; "" for none.
     """
 
     image: Image

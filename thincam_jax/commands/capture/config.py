@@ -45,7 +45,7 @@ class DeviceConfig(Section):
 
 
 class CameraConfig(DeviceConfig, section(CameraSettings), section(Sensor, only=("pitch",))):
-    """The camera and its settings; `pitch`: pitch of its pixels."""
+    """The camera and its settings; `pitch`: side of its pixels."""
 
     pixel_format: Literal[tuple(BIT_DEPTHS)] = "Mono12"  # pyright: ignore[reportInvalidTypeForm]
 
@@ -70,7 +70,7 @@ class DisplayConfig(
     section(FresnelZoneAperture, only=("fill_factor",)),
     section(Procedure, only=("settle",), defaults={"settle": None}),
 ):
-    """The modulator or monitor; `pitch`: its pixels'; `settle`: left out, it is measured.
+    """The modulator or monitor; `pitch`: side of its pixels; `settle`: measured if left out.
 
     - `phase_levels`: levels of a phase modulator, which shows the file's `mask`.
     """
@@ -90,8 +90,7 @@ class AcquisitionConfig(section(Procedure, only=("exposure", "timeout", "retries
 class OpticsConfig(Section):
     """The lensless camera; `distance`: from the modulator to the sensor, with the stage at 0.
 
-    - `colours`: colours of a Bayer format, wavelengths of red, green and blue in place of
-      `wavelength`.
+    - `colours`: wavelengths of red, green and blue of a Bayer format in place of `wavelength`.
     """
 
     wavelength: Wavelength | None = None

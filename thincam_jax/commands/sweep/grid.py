@@ -28,7 +28,7 @@ class Axis:
     - `text`: option that was given, for messages.
     - `path`: key that was given; the name of the table's column.
     - `places`: the entries that it sets, all to the same value: one, or several where it has a `*`.
-    - `values`: numbers that they are set to, in order.
+    - `values`: values that they are set to, in order.
     """
 
     text: str

@@ -76,8 +76,9 @@ class Alignment:
     """Place of a display's pixels on the object's plane, as `fit_alignment` finds it.
 
     - `shape`, `pitch`: number (rows, columns) and pitch (mm) of the display's pixels.
-    - `unknowns`, `covariance`: parameters of a similarity a, b, x, y, for (x + a u − b v, y + b u +
-      a v); of a homography its first eight entries, row by row. u, v: mm from the display's middle.
+    - `unknowns`, `covariance`: parameters and their covariance, of a similarity a, b, x, y, for (x
+      + a u − b v, y + b u + a v); of a homography its first eight entries, row by row. u, v: mm
+      from the display's middle.
     - `marks`, `used`: that were shown; that agree with the map.
     - `residual`: root mean square distance of these from the map, mm.
     """
