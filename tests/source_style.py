@@ -216,6 +216,47 @@ def vague_words(modules: list[Module]) -> list[str]:
     ]
 
 
+_DANGLING = r"(?:Of|As|By|With|Without|From|In|At(?! most)|For|Over|On|Before|What|Which|Those)\b"
+_BEGINNING = re.compile(rf"{_DANGLING}|The same\b")
+_ITEM = re.compile(r"(?:^|[-;.] )(`[^`]+`(?:, `[^`]+`)*(?: \([^)]*\))?: (?:of|as|the same|what))\b")
+# Complaints that files still have: lower a number with each that is mended.
+DANGLING_LEFT = {
+    "commands/reconstruct/options.py": 3,
+    "commands/reconstruct/run.py": 4,
+    "measured/dark.py": 1,
+    "measured/exposures.py": 1,
+    "measured/preparation.py": 2,
+    "reconstruction/imaging_model.py": 2,
+    "reconstruction/recording.py": 1,
+}
+
+
+def docstrings(module: Module) -> Iterator[tuple[int, str]]:
+    """Line and text of each docstring, in one line."""
+    for node in module.nodes:
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            if text := ast.get_docstring(node):
+                yield node.body[0].lineno, " ".join(text.split())
+
+
+def dangling(module: Module) -> list[str]:
+    """Docstrings and their items that can only be read with the signature."""
+    complaints = []
+    for line, text in docstrings(module):
+        place = f"{module.path}:{line}"
+        if found := _BEGINNING.match(text):
+            complaints.append(f"{place}: '{found[0]} …': begin with a noun: what it returns or is")
+        for found in _ITEM.finditer(text):
+            complaints.append(f"{place}: {found[1]} …: name the quantity: '`tau`: weight of …'")
+    return complaints
+
+
+def dangling_prose(modules: list[Module]) -> list[str]:
+    """A docstring and each item in it begin with a noun, with a unit where it has one."""
+    found = {module.path: dangling(module) for module in modules}
+    return [text for path in found for text in found[path][DANGLING_LEFT.get(path, 0) :]]
+
+
 STYLE_RULES = (
     asserted_work,
     bare_files,
@@ -228,6 +269,7 @@ STYLE_RULES = (
     missing_annotations,
     rounded_products,
     vague_words,
+    dangling_prose,
 )
 
 # rule, file, source, part of the complaint
@@ -236,6 +278,12 @@ BROKEN_STYLE = [
     (asserted_work, "design/a.py", "assert isinstance(a := 1, int)", "does more than look"),
     (asserted_work, "design/a.py", "assert a.b is not None and a.pop()", "put it before"),
     (vague_words, "design/a.py", "told = 'alike: cannot be told apart'", "reported, given"),
+    (dangling_prose, "design/a.py", '"""Of all designs, mm."""', "a.py:1: 'Of …': begin with"),
+    (dangling_prose, "design/a.py", '"""The same of a study."""', "'The same …': begin"),
+    (dangling_prose, "design/a.py", 'class A:\n    """What it is."""', "a.py:2: 'What …': begin"),
+    (dangling_prose, "design/a.py", '"""A.\n\n- `b`, `c`:\n  of it."""', "`b`, `c`: of …: name"),
+    (dangling_prose, "design/a.py", '"""A.\n\n`a`: mm; `tau`: as of B."""', "`tau`: as …: name"),
+    (dangling_prose, "design/a.py", '"""A.\n\n- `a` (y, x): what it is."""', "`a` (y, x): what …"),
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
     (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 PACKAGE = "thincam_jax"
 ENTRY = ("__init__", "__main__")  # they stand above all rooms but the one outside
-DOC = '"""What it is."""\n'
+DOC = '"""Example of a module."""\n'
 MAX_LINES, MOST_PARAMETERS = 500, 6
 
 _SEVEN = [f"{name}: int" for name in "abcdefg"]
@@ -18,6 +18,7 @@ FIELDS, TAKEN = "\n".join(f"    {field}" for field in _SEVEN), ", ".join(_SEVEN)
 SOUND = [
     ("units.py", DOC + "import math\n\n\n@dataclass(frozen=True)\nclass A:\n    x: int"),
     ("_core/memory.py", "x = Path('/proc/meminfo').read_text()"),
+    ("design/prose.py", '"""At most one, of `a`: of all; as `b`.\\n\\n- `c`: weight, as given."""'),
     ("_core/grids.py", DOC + "from ..units import mm"),
     ("lensless/masks/_pattern.py", "x = 1"),
     ("lensless/masks/__init__.py", DOC + "from .fza import Plate as Plate"),

@@ -128,7 +128,7 @@ def _kinds(annotation: Any) -> _Kinds:
 
 
 def _plain(words: str, *classes: Any) -> _Kind:
-    """Of these classes, and a truth value only where it is one of them."""
+    """Kind of value: of these classes, and a truth value only where it is one of them."""
 
     def holds(value: Any) -> bool:
         is_truth = isinstance(value, bool | np.bool_)

@@ -71,7 +71,7 @@ def opened(
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
     """The Zarr group at `path` and its attributes, for a block that takes its arrays.
 
-    - `wanted`: what it is to be, and what makes one.
+    - `wanted`: kind that it has to be, and what makes one.
 
     **Errors**: CaptureStoreError, one line, where it is of none of the `kinds` or of another
     version, or where the block finds something missing or wrong.

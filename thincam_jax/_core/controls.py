@@ -11,7 +11,7 @@ from thincam_jax._core import checks
 class Control:
     """A number that is turned.
 
-    - `name`: of what it sets; `label`, `unit`: as shown.
+    - `name`: name of what it sets; `label`, `unit`: words that are shown.
     - `low`, `high`, `value`: in the shown unit. `scale`: units of the package of one shown unit.
     """
 
@@ -37,7 +37,8 @@ class Message(Protocol):
 class Controlled(Protocol):
     """Controls and pictures of a page.
 
-    - `captions`: of its pictures, by name, "transfer" that of a curve; None for those of a camera.
+    - `captions`: captions of its pictures, by name, "transfer" that of a curve; None for those of a
+      camera.
     - `live`: whether it changes by itself, so that the page goes on asking.
     """
 

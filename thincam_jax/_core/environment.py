@@ -54,7 +54,7 @@ def environment(seconds: float | None = None) -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    """Of the checkout that the package is run from; None of one that was installed."""
+    """Commit of the checkout that the package is run from; None where it was installed."""
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():
         return None
@@ -108,7 +108,7 @@ def usable_cores() -> int:
 
 
 def dtype_support() -> dict[str, str]:
-    """Which precisions the default device computes in, tried out."""
+    """Precisions that the default device computes in, tried out."""
     support = {}
     for name in ("float32", "complex64", "float64", "complex128"):
         if name in ("float64", "complex128") and not jax.config.read("jax_enable_x64"):

@@ -60,7 +60,7 @@ class Grid(eqx.Module):
         return centred_frequencies(self.shape[1], self.pitch)
 
     def with_shape(self, shape: tuple[int, int]) -> "Grid":
-        """The same pitch over another number of samples."""
+        """Grid of this pitch with another number of samples."""
         return Grid(shape, self.pitch)
 
 
@@ -113,8 +113,8 @@ def central_blocks(shape: tuple[int, int], size: int) -> tuple[slice, slice]:
 def block_sum(image: Any, size: int, dtype: Any = None) -> Any:
     """Sums over size × size blocks of the last two axes, whose lengths are multiples of `size`.
 
-    For NumPy and JAX. `dtype`: of the sums, by default the one of `sum`. Rows first, which leaves
-    little for the slower sum along them.
+    For NumPy and JAX. `dtype`: type of the sums, by default the one of `sum`. Rows first, which
+    leaves little for the slower sum along them.
     """
     *batch, rows, columns = image.shape
     tall = image.reshape(*batch, rows // size, size, columns).sum(axis=-2, dtype=dtype)

@@ -96,7 +96,7 @@ def npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _npy_size(file: Any) -> tuple[int, int]:
-    """Before NumPy allocates what a damaged header announces."""
+    """Number of values and bytes, before NumPy allocates what a damaged header announces."""
     shape, dtype = npy_header(file)
     begin, count = file.tell(), math.prod(int(n) for n in shape)
     size, held = dtype.itemsize * count, file.seek(0, os.SEEK_END) - begin
@@ -141,7 +141,7 @@ def _jpeg_size(file: Any) -> tuple[int, int]:
 
 
 def _check_jpeg(data: bytes) -> None:
-    """As many coded blocks as the image has: what follows them makes no difference to it."""
+    """Require as many coded blocks as the image has: data after them make no difference to it."""
     if (count := data.count(_JPEG_SCAN)) > _MOST_SCANS:
         raise ImageFileError(f"has {count} scans, at most {_MOST_SCANS} are read; save it anew")
     begin, _, end = data.rpartition(_JPEG_END)

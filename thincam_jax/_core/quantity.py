@@ -40,13 +40,14 @@ class Quantity:
     """One number or choice, made by `quantity` or `choice`; called, it is the field's converter.
 
     - `unit`: one of `UNITS`, or words for messages.
-    - `check`: of a name and a value: the value to keep, or ValueError or TypeError in one line.
+    - `check`: function of a name and a value: the value to keep, or ValueError or TypeError in one
+      line.
     - `positive`, `optional`: above 0; may be None.
     - `choices`: all that are allowed; empty for numbers.
     - `least`, `most`: ends of the range, where it has any.
     - `many`: a tuple of such values, of any length.
-    - `parts`: of a dictionary, by its keys.
-    - `name`: of the field; a `Module` tells it.
+    - `parts`: quantities of a dictionary, by its keys.
+    - `name`: name of the field, which a `Module` gives it.
     """
 
     unit: str
@@ -71,7 +72,7 @@ class Quantity:
 
     @property
     def kind(self) -> str:
-        """Of `units.parse_quantity`; empty for what stands without a unit in a file."""
+        """Kind that `units.parse_quantity` reads; empty for what has no unit in a file."""
         light = self.check in (checks.wavelength, checks.wavelengths)
         return "wavelength" if light else _WRITTEN.get(self.unit, "")
 

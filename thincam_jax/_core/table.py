@@ -7,7 +7,7 @@ Cell = str | float | int | None
 
 
 def number(value: float | None, digits: int) -> str:
-    """With so many decimals; a dash for none."""
+    """Text of a value with so many decimals; a dash for none."""
     return "–" if value is None else f"{value:.{digits}f}"
 
 

@@ -21,7 +21,7 @@ class BenchFolder(RunFolder):
 
 
 def sizes_of_psfs(asked: tuple[int, ...], sensor: SensorConfig) -> tuple[int, ...]:
-    """Those asked for, else the default ones and the sensor's own; each once, smallest first."""
+    """Sizes requested, else the default ones and the sensor's own; each once, smallest first."""
     own = max(sensor.shape)
     return tuple(sorted(set(asked or (*(s for s in _SIZES if s < own), own))))
 
@@ -32,7 +32,7 @@ def check(
     """Refuse what cannot be run, before anything is; ConfigError, one line for each fault.
 
     - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
-    - `capture_size`: the same for captures and reconstructions; None for the default.
+    - `capture_size`: pixels along that side for captures and reconstructions; None for the default.
     """
     if config.mask.pixel_pitch is not None:
         fault = "mask.pixel_pitch: the models compared have no display pixels"

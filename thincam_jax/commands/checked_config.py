@@ -1,4 +1,4 @@
-"""From the text of an experiment file to checked sections, a line for every fault, and back."""
+"""Checked sections of an experiment file's text, with a line for every fault, and back."""
 
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -55,9 +55,9 @@ def dump_config(config: pydantic.BaseModel) -> str:
 
 
 def _own(errors: list[Any]) -> list[Any]:
-    """Without the lists that pydantic calls too short because it dropped a faulty entry.
+    """Errors but for lists that pydantic calls too short because it dropped a faulty entry.
 
-    Of a file of another kind only that: its other keys are right for what it is.
+    A file of another kind has only that error: its other keys are right for what it is.
     """
     other = [error for error in errors if error["loc"] == ("kind",)]
     return other or [

@@ -92,7 +92,7 @@ def costs(asked: Any, setup: Any = None) -> Iterator[str]:
 
 
 def psfs(asked: Any, setup: Any) -> Iterator[str]:
-    """Of a study: its PSFs."""
+    """PSFs of a study."""
     from thincam_jax.commands.study.build import assemble
 
     study = assemble(asked) if setup is None else getattr(setup, "study", setup)
@@ -120,7 +120,7 @@ def _psfs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[st
 
 
 def rays(asked: Any, setup: Any) -> Iterator[str]:
-    """Of a see-through camera: rays, and entries of its matrix."""
+    """Rays of a see-through camera, and entries of its matrix."""
     from thincam_jax._core.memory import readable
     from thincam_jax.commands.screen.run import build_cameras, build_plane
     from thincam_jax.waveguide.system import entries_of_a_ray
@@ -142,7 +142,7 @@ def rays(asked: Any, setup: Any) -> Iterator[str]:
 
 
 def search(asked: Any, setup: Any) -> Iterator[str]:
-    """Of a design: the PSFs of the design to beat, and the evaluations of the search."""
+    """PSFs of the design to beat, and evaluations of a design's search."""
     asks, shots = asked.search, asked.reference.shots
     exposures = asked.design(asked.reference).exposures
     cameras = exposures.cameras(asked.sensor.build(), asked.mask.build(beta=1.0))
@@ -164,7 +164,7 @@ def search(asked: Any, setup: Any) -> Iterator[str]:
 
 
 def frames(asked: Any, setup: Any) -> Iterator[str]:
-    """Of a capture: frames, and the time that they are exposed."""
+    """Frames of a capture, and the time that they are exposed."""
     from thincam_jax.commands.capture.command import build_plan
 
     plan = build_plan(asked) if setup is None else setup
@@ -173,7 +173,7 @@ def frames(asked: Any, setup: Any) -> Iterator[str]:
 
 
 def lessons(asked: Any, setup: Any) -> Iterator[str]:
-    """Of a training: its steps and checks."""
+    """Steps and checks of a training."""
     training = asked.training
     checks = training.steps // training.check_every
     yield (

@@ -16,7 +16,7 @@ def end_on_interrupt() -> None:
 
 
 def leave(*_: object) -> None:
-    """At once: an exception would meet imports and libraries that are not ready for one."""
+    """Leave at once: an exception would meet imports and libraries not ready for one."""
     os.write(2, b"thincam: interrupted\n")
     os._exit(INTERRUPTED)
 

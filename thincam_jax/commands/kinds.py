@@ -18,13 +18,13 @@ from thincam_jax.commands.terminal import reported, say, say_result, show
 class Kind:
     """One kind of experiment file.
 
-    - `noun`: what such a file is. `command`: of `thincam`, that takes it.
+    - `noun`: name of such a file. `command`: command of `thincam` that takes it.
     - `section`: its configuration, as MODULE:NAME in `thincam_jax.commands`.
-    - `costs`: of a configuration and its objects, lines that say what its run computes.
+    - `costs`: function of a configuration and its objects that gives lines about its run.
     - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
-    - `build`, `run`: of those for `thincam run`, what makes objects of the configuration, and what
-      runs these into a folder; its result has a `table`. Of those for `thincam train`, what makes
-      the lessons, and what trains in a folder.
+    - `build`, `run`: functions. For `thincam run`: makes objects of the configuration, and runs
+      these into a folder; its result has a `table`. For `thincam train`: makes the lessons, and
+      trains in a folder.
     """
 
     noun: str

@@ -22,7 +22,7 @@ APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 
 
 class ApertureConfig(section(masks.FresnelZoneAperture, only=APERTURE)):
-    """Keys of all Fresnel zone apertures; `pixel_pitch`, `fill_factor`: of a display."""
+    """Keys of all Fresnel zone apertures; `pixel_pitch`, `fill_factor`: for a display."""
 
     @pydantic.model_validator(mode="after")
     def _display(self):
@@ -101,17 +101,17 @@ class MaskConfig(
 ):
     """The mask of a study: a Fresnel zone aperture, or of another `family` with its numbers.
 
-    - `height`, `harmonics`: of a rectangle, and which orders of a zone plate are computed.
+    - `height`, `harmonics`: height of a rectangle, and orders of a zone plate that are computed.
     - `cell`: side of a cell or of a lens. Arrays have the `width` of their cells.
     - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose code
       and itself `combine`; `tiles`: how often an array is repeated along each axis.
-    - `seed`: of what is random; `focal_length`, `lenses` (down, across): of "lenslets".
-    - `path`: of a grey image, a "file", whose pixels make up the `width`; of a "phase", rad in a
-      .npy or parts of a turn in an image.
-    - `correlation_length`, `rms_slope`: of a "diffuser"; `sites`: lenses of "voronoi_fresnel", made
-      for the wavelength; `feature`, `line_width`: of the "contours" that are the PSF far away, at
-      the wavelength and distance of the first shot. `index`: of refraction, of all three, whose
-      PSFs are by "angular_spectrum".
+    - `seed`: seed of what is random; `focal_length`, `lenses` (down, across): for "lenslets".
+    - `path`: path of a grey image, a "file", whose pixels make up the `width`; of a "phase", rad in
+      a .npy or parts of a turn in an image.
+    - `correlation_length`, `rms_slope`: scale and slope of a "diffuser"; `sites`: lenses of
+      "voronoi_fresnel", made for the wavelength; `feature`, `line_width`: size of the "contours"
+      that are the PSF far away, at the wavelength and distance of the first shot. `index`:
+      refractive index of all three, whose PSFs are by "angular_spectrum".
     """
 
     beside: ClassVar[tuple[str, ...]] = ()  # keys of a section that are not of the mask itself
@@ -157,13 +157,13 @@ class MaskConfig(
         return self
 
     def _cells_across(self) -> int | None:
-        """Of one array, where they are known by its numbers."""
+        """Number of cells across one array, where its numbers give it."""
         pair = self.orders or self.lenses
         return pair[1] if pair else self.order or self.length
 
     @property
     def label(self) -> str:
-        """In a line of a report: size and kind."""
+        """Label in a line of a report: size and kind."""
         if self.family == "fza":
             height = f"×{self.height:g}" if self.height else ""
             return f"{self.width:g}{height} mm ({self.profile})"

@@ -56,7 +56,7 @@ class PlacedConfig(section(SceneObject, only=_PLACE), TargetConfig):
 
 
 class SweepConfig(section(FocusRange)):
-    """Over which distances, by which method, and what is called sharp."""
+    """Distances and method of a sweep of the focus, and what is called sharp."""
 
     method: Name
 

@@ -27,7 +27,7 @@ class Picture:
     The page holds a small copy, with a link to the file; one that is folded it only links to.
 
     - `file`: its path from the folder of figures.
-    - `alt`: what it shows, for who cannot see it. `caption`: stands below.
+    - `alt`: content in words, for who cannot see it. `caption`: stands below.
     - `folded`: a line under which it is hidden until it is opened.
     """
 
@@ -64,7 +64,7 @@ class Part:
 
     @property
     def anchor(self) -> str:
-        """Its place in the page's address."""
+        """Anchor of the section in the page's address."""
         return slug(self.short or self.title)
 
 
@@ -107,7 +107,7 @@ def render_report(
     """A page as HTML, with the experiment's configuration and how it was computed at its end.
 
     - `folder`: that of the page, and `figures`: that of its figures therein.
-    - `environment`: of the run, as `_core.environment.environment` gives it.
+    - `environment`: environment of the run, by `_core.environment.environment`.
 
     Texts are escaped; a name that is missing is an error.
     """
@@ -121,7 +121,7 @@ def render_report(
     kinds = {Table: "table", Picture: "picture", Gallery: "gallery", Sentences: "sentences"}
 
     def address(picture: Picture) -> str | None:
-        """Of the file, from the page; None where it was not drawn."""
+        """Address of the file from the page; None where it was not drawn."""
         path = os.path.normpath(Path(figures) / picture.file)
         return quote(path) if (folder / path).exists() else None
 

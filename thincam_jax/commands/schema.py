@@ -39,7 +39,7 @@ class Section(pydantic.BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
-        """For editors: each key with what the docstring says of it."""
+        """JSON schema for editors: each key with what the docstring says of it."""
         form = handler.resolve_ref_schema(handler(core_schema))
         about = descriptions(cls)
         for key, entry in form.get("properties", {}).items():

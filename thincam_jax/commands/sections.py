@@ -76,8 +76,8 @@ class NoiseConfig(section(GaussianNoise, PoissonGaussianNoise, defaults=_EITHER)
 class ShotConfig(Section):
     """One setting of the camera; the phases of the synthesis are taken at each.
 
-    - `width`, `profile`: of its masks; default those of the study.
-    - `exposure`: of each of its captures, relative to that of the sensor.
+    - `width`, `profile`: width and profile of its masks; default those of the study.
+    - `exposure`: exposure of each of its captures, relative to that of the sensor.
     - `take`: 2 for a second exposure of a setting, which has noise of its own; and so on.
     """
 
@@ -91,7 +91,7 @@ class ShotConfig(Section):
 
 
 class MethodShotConfig(ShotConfig):
-    """The same of a method; masks of other families than the zone plate have no β."""
+    """Setting of the camera in a method; masks other than the zone plate have no β."""
 
     beta: Curvature | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -122,7 +122,7 @@ PHASES = {"fringe_scanning": QUARTERS, "phase_pairs": PAIR}
 class MethodConfig(Section):
     """A reconstruction and the captures that it takes.
 
-    - `steps`, `harmonics`: of the synthesis harmonics, how many phases of a turn it takes at each
+    - `steps`, `harmonics`: number of phases of a turn that the synthesis harmonics takes at each
       shot, and the m that it keeps.
     """
 
@@ -187,8 +187,8 @@ class PictureConfig(TargetConfig):
 
     - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where it
       is below its mean, else white.
-    - `width`: of the picture, and `x`, `y` of its middle, y downwards, in parts of the width of the
-      cells, which are black beside it; `rotation`: clockwise.
+    - `width`: width of the picture, and `x`, `y` of its middle, y downwards, in parts of the width
+      of the cells, which are black beside it; `rotation`: clockwise.
     """
 
     crop: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -229,7 +229,7 @@ class ExperimentConfig(Section):
         return found, faults
 
     def read_all(self, entries: str, read: Callable[[Any], Found], *key: str) -> list[Found]:
-        """The same; ConfigError, a line for each entry that is refused."""
+        """Results as of `read_each`; ConfigError, a line for each entry that is refused."""
         found, faults = self.read_each(entries, read, *key)
         if faults:
             raise ConfigError("\n".join(faults))

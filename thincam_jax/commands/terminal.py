@@ -137,10 +137,10 @@ def show(table: "Table") -> None:
 
 @contextlib.contextmanager
 def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
-    """With a count and the times; `more` are templates, as "{task.fields[objective]}".
+    """Progress bar with a count and the times; `more`: templates, "{task.fields[objective]}".
 
-    It is seen once it is started: before, all may be refused. What is done under it has something
-    to keep when it is interrupted.
+    Hidden until it is started: before, all may be refused. What is done under it has something to
+    keep when it is interrupted.
     """
     from rich import progress
 

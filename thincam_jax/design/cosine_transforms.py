@@ -22,7 +22,7 @@ from thincam_jax._core.precision import product
 
 
 def half_places(count: int, pitch: Number) -> Float[Array, " place"]:
-    """Those of `count` centred samples that are not negative, ascending; in the pitch's unit."""
+    """Non-negative places among `count` centred samples, ascending, in the pitch's unit."""
     step = jnp.asarray(pitch)
     return centred_indices(count, step.dtype)[count // 2 :] * step
 

@@ -26,7 +26,7 @@ class Shot:
     """Captures of a design that differ in phase only.
 
     - `beta`: rad/mm²; `distance`, `wavelength`, `width` of the mask: mm.
-    - `exposure`: of each capture, relative to the others.
+    - `exposure`: exposure of each capture, relative to the others.
     """
 
     beta: float
@@ -45,7 +45,7 @@ class Design(Module):
     - `distance`: mask to sensor, mm.
     - `wavelength`: mm.
     - `exposure`: its share of the exposure time, relative to the others.
-    - `width`: of all masks, mm.
+    - `width`: width of every mask, mm.
     """
 
     beta: Float[Array, " capture"] = eqx.field(converter=unchecked("rad/mm^2"))

@@ -66,7 +66,7 @@ def restore(design: Design, training: Training) -> Float[Array, "image v u"]:
 
 
 def restore_by(cameras: tuple[Channel, ...], training: Training) -> Float[Array, "image v u"]:
-    """The same by cameras of any kind, one for each row of the training's synthesis."""
+    """Images restored from captures of any cameras, one for each row of a training's synthesis."""
 
     def one(image, noise):
         measured = [c.capture(image, n) for c, n in zip(cameras, noise, strict=True)]

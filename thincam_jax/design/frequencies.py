@@ -25,7 +25,7 @@ class Quadrant(eqx.Module):
     and its variance is missed.
 
     - `axis`: ν from zero up, cycles/rad, along either axis.
-    - `weight`: of each point, so that Σ w g is ∬ g dν_x dν_y over the plane.
+    - `weight`: area that each point stands for, so that Σ w g is ∬ g dν_x dν_y over the plane.
     """
 
     axis: Float[Array, " n"]
@@ -51,7 +51,7 @@ class Quadrant(eqx.Module):
         return self.axis[-1]
 
     def ring(self, rings: int) -> Int[np.ndarray, " point"]:
-        """Which of `rings` rings up to the highest each point lies in; `rings` for the corners."""
+        """Ring of each point, of `rings` up to the highest frequency; number `rings` in corners."""
         place = np.arange(len(self.axis)) / (len(self.axis) - 1)
         radius = np.hypot(place[:, None], place).ravel()
         return np.where(radius < 1, np.minimum(radius * rings, rings - 1), rings).astype(int)
@@ -63,7 +63,7 @@ class Polar(eqx.Module):
 
     Directions are Gauss-Legendre nodes of an octant, which stands for all eight.
 
-    - `radius`: |ν|, cycles/rad; `cosine`, `sine`: of each direction.
+    - `radius`: |ν|, cycles/rad; `cosine`, `sine`: components of each direction.
     - `weight`: so that Σ w g is ∬ g dν_x dν_y over the disc.
     """
 
@@ -98,7 +98,7 @@ class Polar(eqx.Module):
         return self.radius[-1] + 0.5 * (self.radius[1] - self.radius[0])
 
     def ring(self, rings: int) -> Int[np.ndarray, " point"]:
-        """Which of `rings` rings up to the highest each point lies in."""
+        """Ring of each point, of `rings` up to the highest frequency."""
         place = (np.arange(len(self.radius)) + 0.5) / len(self.radius)
         return np.tile((place * rings).astype(int), len(self.cosine))
 

@@ -34,8 +34,8 @@ class FrontPoint(eqx.Module):
 
     - `cost`: in the unit of the front.
     - `resolution`: cycles/rad, up to which every ring's signal-to-noise ratio is at least 1.
-    - `ends`: what ends it other than the signal, in words; empty where nothing does.
-    - `error`: of the best linear reconstruction, as a part of the scene's variance.
+    - `ends`: cause other than the signal that ends it, in words; empty where nothing does.
+    - `error`: error of the best linear reconstruction, as a part of the scene's variance.
     """
 
     cost: float
@@ -64,7 +64,7 @@ def find_front(
     - `problems`: by rising cost, what may be designed for it: `DesignProblem.with_thickness`,
       `with_electrons`, `with_captures`, or spaces of your own. Their data are `ObjectiveData` with
       the exact frequencies in common.
-    - `settings`: of each search. `progress`: called with the cost as a search begins.
+    - `settings`: settings of each search. `progress`: called with the cost as a search begins.
 
     Designs are ranked by their resolution where the objective is `ResolutionLimit`, else by their
     expected error.
@@ -206,7 +206,7 @@ def _limit_and_error(
 
 @checked
 def non_dominated(points: Numbers, *, larger: Sequence[bool]) -> Bool[np.ndarray, " point"]:
-    """Which points lie on the Pareto front: no other one beats them in everything.
+    """Mask of the points on the Pareto front: no other one beats them in everything.
 
     A point is dominated by another one that is no worse in every objective and better in at least
     one. Points with the same numbers do not dominate each other; a NaN is on no front and dominates

@@ -107,7 +107,7 @@ def landscape_around(
 def landscape_if_any(
     problem: DesignProblem, design: Design, count: int, *, at_a_time: int = AT_A_TIME
 ) -> Landscape | None:
-    """As `landscape_around`; None where there is no number to draw, or no room."""
+    """Landscape by `landscape_around`; None where there is no number to draw, or no room."""
     drawn = drawn_variables(problem.space)
     if not drawn:
         return None

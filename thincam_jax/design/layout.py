@@ -41,7 +41,7 @@ def write_gds(
 
     **Arguments**
 
-    - `tone`: what is drawn, the open parts or, within the mask's extent, the opaque ones.
+    - `tone`: parts that are drawn, the open ones or, within the mask's extent, the opaque ones.
     - `layer`, `cell`: number of the layer, of data type 0, and name of the cell.
     - `smallest_feature`: the finest line that can be written, mm: a mask with a finer open or
       opaque part is refused. Along rows, columns and radii; corners are not measured.

@@ -64,7 +64,7 @@ def response_misfit(
 
 
 def root_mean_square(difference: Float[Array, " ring"]) -> Float[Array, ""]:
-    """With a slope of 0, not NaN, where all is 0."""
+    """Root mean square over the rings, with a slope of 0, not NaN, where all is 0."""
     return jnp.sqrt(jnp.mean(difference**2) + jnp.finfo(difference.dtype).eps ** 2)
 
 
@@ -74,9 +74,9 @@ def _decibels(natural: Float[Array, " ring"]) -> Float[Array, " ring"]:
 
 @checked
 class ResponseModel(eqx.Module):
-    """From points of a space's unit cube to the levels that their designs give.
+    """Response levels of the designs at points of a space's unit cube.
 
-    - `space`: what is free; `setup`, `synthesis`, `frequencies`: as of `channels`.
+    - `space`: numbers that are free; `setup`, `synthesis`, `frequencies`: arguments of `channels`.
     - `rings`: number of levels.
 
     **Errors**: ValueError for rings below 1, or of which some hold no frequency.
@@ -109,7 +109,7 @@ class ResponseModel(eqx.Module):
         self.rings = rings
 
     def levels(self, point: Float[Array, " variable"]) -> Float[Array, " ring"]:
-        """Of the design at a point, dB."""
+        """Ring levels of the design at a point, dB."""
         known = channels(self.space.design(point), self.setup, self.synthesis, self.frequencies)
         return ring_levels(known, self.frequencies, self.rings)
 
@@ -156,7 +156,7 @@ class MatchSettings:
     """Length of a search for a response.
 
     - `starts`: descents (optimistix' Levenberg-Marquardt under the smooth map sin² onto the cube);
-      `samples`: of the even sampling before, from the best of which they start.
+      `samples`: points of the even sampling before, from the best of which they start.
     - `steps`: at most, of each descent; it ends where a step changes the misfit by less than
       `tolerance` of itself.
     - `tolerance_db`: misfits up to here are "matched".
@@ -184,7 +184,8 @@ class Match(Module):
     - `misfit_db`: the best of them; infinite if there is none.
     - `status`: "matched" within the tolerance, "not_attained", or "non_finite" if no design that
       was looked at has a response.
-    - `evaluations`: of the response, with or without its derivatives, samples included.
+    - `evaluations`: number of evaluations of the response, with or without its derivatives, samples
+      included.
     - `failed`: how many samples and descents met a response that is not finite.
     """
 

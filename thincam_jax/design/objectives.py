@@ -39,10 +39,10 @@ _PART = quantity(check=functools.partial(checks.between, unit="a ratio", least=0
 class Channels(eqx.Module):
     """The sums of captures that a reconstruction starts from, at each frequency.
 
-    - `response`: of each, H̄, as seen at one distance: mm²·mm.
+    - `response`: transfer function H̄ of each sum, as seen at one distance, mm²·mm.
     - `noise`: its noise spectrum η, with what the sensor cuts off.
     - `density`: η_f of the scene.
-    - `weight`: of the integral over frequencies.
+    - `weight`: weight of each frequency in integrals over the plane.
     """
 
     response: Float[Array, "channel *point"]
@@ -205,8 +205,9 @@ class Tolerances:
 
     - `beta`: relative, of each capture's mask on its own.
     - `distance`: mm, of each capture on its own; `wavelength`: mm, `object_distance`: mm, of all.
-    - `tilt`: of the mask against the sensor, rad. Over a mask of width w it makes the distance
-      vary evenly with a standard deviation of tilt·w/√12, and is counted as an error of that size.
+    - `tilt`: angle of the mask against the sensor, rad. Over a mask of width w it makes the
+      distance vary evenly with a standard deviation of tilt·w/√12, and is counted as an error of
+      that size.
     """
 
     beta: Annotated[float, _PART] = 0.0
@@ -311,7 +312,7 @@ class AbstractObjective:
     A subclass is a frozen dataclass of its settings, so that equal objectives are compiled once.
     It defines `value`, and as class variables:
 
-    - `name`: in experiment files; `quantity`: in words; `unit`: of the reported value.
+    - `name`: name in experiment files; `quantity`: reported quantity in words; `unit`: its unit.
     - `maximised`: whether larger values are better; the cost is then the negative value.
     """
 

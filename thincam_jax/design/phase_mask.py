@@ -75,7 +75,7 @@ class HeightLimits:
     levels: int | None = None
 
     def checked(self) -> "HeightLimits":
-        """The same, or ValueError in one line."""
+        """These limits where they are possible; else a ValueError of one line."""
         if not 0 < self.highest <= HIGHEST:
             raise ValueError(f"highest = {self.highest:g} mm; give more than 0, up to {HIGHEST:g}")
         if self.levels is not None and self.levels < 2:
@@ -125,8 +125,9 @@ def contour_mask(
 ) -> PhaseMask:
     """The mask whose PSF at a path's wavelength and distances is nearest to a `contour_target`.
 
-    - `key`: of `jax.random`, or a seed. `path`: of the light; see `retrieve_phase`.
-    - `feature`, `line_width`: of the lines, mm; see `contour_target`.
+    - `key`: key of `jax.random`, or a seed. `path`: path of the light; see `retrieve_phase`.
+    - `feature`, `line_width`: size of the noise's features and width of the lines, mm; see
+      `contour_target`.
 
     ```python
     import thincam_jax as tc
@@ -149,8 +150,8 @@ class MaskSetting(eqx.Module):
 
     - `sensor`, `distance`: mask to sensor, mm. `wavelengths`, `object_distances`: mm.
     - `together`: the sensor sees all wavelengths as one grey image; else each has its own.
-    - `field_shape`: of the scene on the sensor's pitch, at most 2048 samples: what falls beside the
-      sensor is lost. None takes the sensor's rims to meet.
+    - `field_shape`: rows and columns of the scene on the sensor's pitch, at most 2048 samples: what
+      falls beside the sensor is lost. None takes the sensor's rims to meet.
     """
 
     sensor: Sensor
@@ -190,7 +191,7 @@ class MaskSetting(eqx.Module):
 
     @property
     def grid(self) -> Grid:
-        """Of the PSFs: the sensor's, or with a field what its points cast on the sensor."""
+        """Grid of the PSFs: the sensor's, or with a field the extent that its points cast."""
         if self.field_shape is None:
             return self.sensor.grid
         return kernel_grid(self.sensor.grid, self.field_shape)

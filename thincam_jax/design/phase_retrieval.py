@@ -28,7 +28,7 @@ from thincam_jax.lensless.propagation.path import Path
 class Retrieval(Module):
     """Result of `retrieve_phase`.
 
-    - `phase`: of each cell of the mask, rad, from 0 to 2π.
+    - `phase`: phase of each cell of the mask, rad, from 0 to 2π.
     - `error`: `match_error` of the PSF at the beginning of every step.
     """
 
@@ -50,7 +50,7 @@ def retrieve_phase(
     - `target`: irradiance on `grid`, in any unit, ≥ 0. `path`: wavelength and distances.
     - `shape`: cells (rows, columns) of the mask, as large as the samples of `grid`; even where its
       are, and odd where they are odd, so that their centres agree.
-    - `key`: of the random phase to begin with. `steps`: of to and fro.
+    - `key`: key of the random phase to begin with. `steps`: number of turns to the sensor and back.
 
     **Errors**: ValueError for a target that is negative, not finite or without light.
     """
@@ -127,7 +127,7 @@ def contour_target(
     has no zeros: the target of PhlatCam (Boominathan et al., IEEE PAMI 42, 1618 (2020)). Lines of
     even width are those where :math:`|N - c| < \tfrac w2 |\nabla N|`.
 
-    - `grid`: of the PSF; beyond it there is no light.
+    - `grid`: grid of the PSF; beyond it there is no light.
     - `feature`: distance of the noise's nodes, mm: how far lines are apart. At least four samples.
     - `line_width`: w, mm, from a sample to `feature`.
     - `levels`: the c; the noise has a standard deviation of about 0.25.

@@ -93,7 +93,7 @@ class PlateLimits(eqx.Module):
     upper: Plate
 
     def plate(self, point: Float[Array, "6"]) -> Plate:
-        """That of a point of the unit cube, its axes in the order of the fields of `Plate`."""
+        """Plate at a point of the unit cube, its axes in the order of the fields of `Plate`."""
         low, high = (jnp.stack(jax.tree.leaves(end)) for end in (self.lower, self.upper))
         values = low + point.astype(low.dtype) * (high - low)
         return jax.tree.unflatten(jax.tree.structure(self.lower), list(values))
@@ -105,9 +105,10 @@ class Viewing(eqx.Module):
 
     - `sensor`: its pixels. `object_distance`, `object_width`: mm. `cell`: the finest detail, mm,
       whose Nyquist frequency ends the integral.
-    - `snr_db`: of the captures of the default plate; another's follows from its light.
-    - `mean`, `variance`: of the object's radiance. `prior`: how its variance is spread,
-      by default `PowerLaw(2.5)`.
+    - `snr_db`: signal-to-noise ratio of the default plate's captures, dB; another's follows from
+      its light.
+    - `mean`, `variance`: moments of the object's radiance. `prior`: how its variance is spread, by
+      default `PowerLaw(2.5)`.
 
     **Errors**: ValueError, one line, for what is out of range.
     """
@@ -187,7 +188,7 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
 
 
 def _rays(plate: Plate, viewing: Viewing):
-    """Over the field, (order, pixel, sample, 2) and weights (order, pixel)."""
+    """Rays from pixels over the field: points (order, pixel, sample, 2), weights (order, pixel)."""
     camera = plate.camera(viewing.sensor)
     rows, columns = viewing.sensor.shape
     along = [(np.arange(n) + 0.5) / n for n in _FIELD]

@@ -24,7 +24,8 @@ class RankedDesign(eqx.Module):
     """A design, its costs (smaller is better) in the search and exactly, and its ring means.
 
     - `level`: signal-to-noise ratio of each ring.
-    - `values`, `status`, `active`: of a design found; empty for a reference.
+    - `values`, `status`, `active`: free numbers, end of the descent and active limits of a design
+      found; empty for a reference.
     - `trained`: the error of the training images, with training.
     """
 

@@ -157,7 +157,7 @@ def _solid(
 
 
 def _triangles(grid: np.ndarray, *, fan: bool) -> np.ndarray:
-    """Of every quadrangle: two where it is plane, else four around the mean of its corners.
+    """Triangles of each quadrangle: two where it is plane, else four around its corners' mean.
 
     Then the volume below is that of the bilinear surface, exactly.
     """

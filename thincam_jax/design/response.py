@@ -38,9 +38,9 @@ from thincam_jax.lensless.propagation.separable_transfer import TransferFactors,
 
 
 class Responses(eqx.Module):
-    """Of a capture, or of each of many, at each frequency, mm².
+    """Transfer functions of a capture, or of each of many, at each frequency, mm².
 
-    - `whole`: H(ν/d), of a sensor without end.
+    - `whole`: response H(ν/d) of a sensor without end.
     - `seen`: q H, what falls on the sensor on average over the object.
     """
 
@@ -66,7 +66,7 @@ def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Respons
 def _factors(
     design: Design, setup: Setup, frequencies: Quadrant
 ) -> Complex[Array, "capture pair n"]:
-    """Of all captures at once."""
+    """One-dimensional factors of the transfer functions of all captures."""
     mask = design.mask(design.beta[0], design.phase[0])
     u = frequencies.axis / design.distance[:, None]
     shift = design.wavelength[:, None] * frequencies.axis
@@ -195,7 +195,7 @@ def signal_variance(
 ) -> Float[Array, " capture"]:
     r"""Variance of each capture over the sensor, mm⁴.
 
-    :math:`\int \eta_f|H|^2 (1 - \mathrm{sinc}^2 L u\ \mathrm{sinc}^2 L v)`: what varies over more
+    :math:`\int \eta_f|H|^2 (1 - \mathrm{sinc}^2 L u\ \mathrm{sinc}^2 L v)`: variation over more
     than the sensor's width L is no variance on it. `density`: η_f, by `spectral_density`.
     """
     power = whole**2 * density * frequencies.weight

@@ -40,8 +40,8 @@ Status = Literal["converged", "iterations_exhausted", "non_finite"]
 class SearchSettings:
     """Length of a search, and its solver.
 
-    - `starts`: descents; `samples`: of the even (scrambled Sobol) sampling before, from which
-      those start that are lowest among their neighbours; at least `starts`.
+    - `starts`: descents; `samples`: points of the even (scrambled Sobol) sampling before, from
+      which those start that are lowest among their neighbours; at least `starts`.
     - `steps`: at most, of each descent.
     - `solver`: "bfgs" (optimistix), under the smooth map sin² onto the cube, or "lbfgsb" (jaxopt)
       within its faces.
@@ -80,7 +80,7 @@ class Found(Module):
 
     - `design`; `values`: its free numbers, in the order of the space's variables.
     - `objective`: its value there.
-    - `status`: of the descent that ended there.
+    - `status`: end of the descent that led there.
     - `active`: the limits it lies against, in words.
     - `point`: in the unit cube.
     """
@@ -96,8 +96,8 @@ class Found(Module):
 class Search(Module):
     """The optima found, best first, without those that repeat a better one.
 
-    - `evaluations`: of the objective, with or without its gradient: of all samples, of each
-      descent up to its own end and of what was improved.
+    - `evaluations`: number of evaluations of the objective, with or without its gradient: all
+      samples, each descent up to its own end and those of the improvement.
     - `failed`: how many samples and descents met an objective that is not finite.
     """
 
@@ -320,7 +320,7 @@ def best_apart(
 ) -> np.ndarray:
     """The lowest samples, each farther from those chosen before than half of the mean spacing.
 
-    `least`: what that is at least, in the cube.
+    `least`: lower bound of that distance, in the cube.
     """
     spacing = max(least, 0.5 * len(points) ** (-1 / points.shape[1]))
     chosen: list[int] = []

@@ -65,7 +65,7 @@ class Derivatives:
 class Sensitivity:
     """Tolerances of the free numbers of a design, and the derivatives that they follow from.
 
-    - `increase`: of the cost, counted as 1 % worse.
+    - `increase`: increase of the cost, counted as 1 % worse.
     """
 
     values: tuple[FreeValue, ...]

@@ -84,14 +84,14 @@ class SignalNoise(Module):
     )
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
-        """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
+        """Noise variance of a pixel, mm⁴, from a capture's mean (mm²), variance and exposure."""
         return signal * 10 ** (-self.snr_db / 10)
 
 
 class PhotonNoise(Module):
     """Shot noise of the design's own light, and read noise.
 
-    - `electrons`: of a pixel, from each mm² of open aperture, in an exposure of one share
+    - `electrons`: electrons of a pixel, from each mm² of open aperture, in an exposure of one share
       (`Design.exposure`): what the mask lets through is the design's own.
     - `read_noise`: standard deviation, electrons, of each capture.
     """
@@ -104,7 +104,7 @@ class PhotonNoise(Module):
     )
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
-        """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
+        """Noise variance of a pixel, mm⁴, from a capture's mean (mm²), variance and exposure."""
         counted = self.electrons * exposure
         return light / counted + (self.read_noise / counted) ** 2
 
@@ -121,7 +121,7 @@ def _prior(given: PowerLaw | None) -> PowerLaw:
 class Setup(Module):
     """A sensor before a scene of mean 1 and the variance `contrast`².
 
-    - `pitch`: of the sensor's pixels, mm; `sensor_width`: mm.
+    - `pitch`: side of the sensor's pixels, mm; `sensor_width`: mm.
     - `object_distance`: t, mm; `object_width`: mm.
     - `noise`: `SignalNoise` or `PhotonNoise`.
     - `prior`: the scene's spectrum.

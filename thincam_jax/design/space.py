@@ -74,7 +74,7 @@ REPORTED = {name: ReportedNumber(_NAMES.get(name, name), one) for name, one in Q
 class Variable:
     """One free number of a design.
 
-    - `name`: of the numbers of `Design`; `DesignSpace` refuses any other.
+    - `name`: name of one of the numbers of `Design`; `DesignSpace` refuses any other.
     - `lower`, `upper`: its bounds, in the design's units.
     - `captures`: which captures share it; for the width, which all share, nothing.
     """
@@ -86,11 +86,11 @@ class Variable:
 
     @property
     def unit(self) -> str:
-        """Of its values."""
+        """Unit of the variable's values."""
         return QUANTITIES[self.name].unit
 
     def label(self) -> str:
-        """Its name, with the captures that it belongs to."""
+        """Name of the variable, with the captures that it belongs to."""
         listed = ", ".join(str(c + 1) for c in self.captures)
         return f"{self.name} of capture {listed}" if self.captures else self.name
 
@@ -104,12 +104,12 @@ class Variable:
 class Limits:
     """Limits of a rig, beside the bounds of single variables.
 
-    - `mask_pixel`: of the display or printer, mm: the zones at the mask's edge keep a period of two
-      of them, β·width ≤ π/mask_pixel.
+    - `mask_pixel`: pixel of the display or printer, mm: the zones at the mask's edge keep a period
+      of two of them, β·width ≤ π/mask_pixel.
     - `thickness`: the longest distance of mask and sensor, mm.
     - `captures`: how many at most.
-    - `exposure`: of all captures together, shares: what the free ones leave is divided among the
-      others as their own shares are.
+    - `exposure`: exposure of all captures together, shares: what the free ones leave is divided
+      among the others as their own shares are.
     """
 
     mask_pixel: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
@@ -211,7 +211,7 @@ class DesignSpace(eqx.Module):
         return eqx.tree_at(lambda d: d.exposure, design, shared)
 
     def _shared_out(self, exposure: Float[Array, " capture"], total: float):
-        """With that total: the captures whose exposure is not free divide the rest."""
+        """Exposures of that total: the captures whose exposure is not free divide the rest."""
         free = {c for v in self.variables if v.name == "exposure" for c in v.captures}
         rest = jnp.asarray([float(c not in free) for c in range(len(exposure))], exposure.dtype)
         left = total - jnp.sum((1 - rest) * exposure)

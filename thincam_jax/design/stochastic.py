@@ -19,7 +19,8 @@ from thincam_jax.design.search import on_cube
 class Descent(Module):
     """Where a stochastic descent ended.
 
-    - `design`, `values`, `point`: of the mean of the second half of the steps, in the cube.
+    - `design`, `values`, `point`: design at the mean of the second half of the steps, its free
+      numbers, and that point of the cube.
     - `history`: the objective, as drawn, at every step.
     - `skipped`: steps whose objective or gradient was not finite; they changed nothing.
     """
@@ -42,7 +43,7 @@ def stochastic_descent(
     """Adam from a point of the unit cube, with the rate falling to zero as a cosine.
 
     - `problem`: its objective is (design, data, key) → a number, at module level.
-    - `rate`: of the angle that sin² maps onto the cube; the cube's side is π/2 of it.
+    - `rate`: step of the angle that sin² maps onto the cube; the cube's side is π/2 of it.
     """
     key = random_key(key)
     if steps < 2 or not rate > 0:

@@ -38,7 +38,7 @@ class Window:
     - `angle`: its side, rad: the sensor as seen through the mask at the shortest distance, and the
       object beside it, so that nothing wraps round.
     - `samples`: along it, as fine as the pixels at the longest distance.
-    - `across`: of them over the sensor's width, at that distance.
+    - `across`: number of samples over the sensor's width, at that distance.
     """
 
     angle: float
@@ -50,7 +50,7 @@ class Window:
 class TrainedSensor:
     """A sensor in training, and where designs may place it.
 
-    - `shape`: of its pixels, as many as there is noise for.
+    - `shape`: rows and columns of pixels, as many as there is noise for.
     - `distances`: the shortest and the longest from the mask, mm.
     """
 
@@ -94,10 +94,11 @@ class Training(eqx.Module):
     - `setup`: the noise's shape divides its `sensor_width` into pixels, larger ones than those of
       its `pitch`; noise is averaged over them.
     - `synthesis`: rows (channel) of weights of the captures; a row adds captures at one distance.
-    - `field_shape`: of the projection on the sensor, at least the object's at the longest distance.
-    - `distances`: mm; `window`: of the angles that a reconstruction's spectrum is taken over.
-    - `solver`: of `end_to_end`; `denoiser`: a function of images and their noise's deviation, with
-      which images are restored by plug and play, see `with_denoiser`.
+    - `field_shape`: samples of the projection on the sensor, at least the object's at the longest
+      distance.
+    - `distances`: mm; `window`: angles that a reconstruction's spectrum is taken over.
+    - `solver`: solver of `end_to_end`; `denoiser`: a function of images and their noise's
+      deviation, with which images are restored by plug and play, see `with_denoiser`.
     """
 
     images: Float[Array, "image v u"]
@@ -150,7 +151,7 @@ class Training(eqx.Module):
 
     @property
     def sensor(self) -> Sensor:
-        """As many pixels as there is noise for."""
+        """Sensor of as many pixels as there is noise for."""
         rows, columns = self.noise.shape[-2:]
         return Sensor((rows, columns), self.setup.sensor_width / max(rows, columns))
 
@@ -165,7 +166,7 @@ class Channel(eqx.Module):
     """A sum of captures at one distance: A_c.
 
     - `kernels`: their PSFs, on `kernel_grid(training.sensor.grid, training.field_shape)`.
-    - `weights`, `exposure`: of each; `distance`: mask to sensor, mm.
+    - `weights`, `exposure`: weight and exposure of each capture; `distance`: mask to sensor, mm.
     """
 
     captures: tuple[CropConvolution, ...]
@@ -223,7 +224,7 @@ def noise_variance(
     setup: Setup,
     pitch: Number,
 ) -> Float[Array, ""]:
-    """Of a pixel of a sum of captures that are `clean` without it, pixels `pitch` (mm) wide."""
+    """Noise variance of a pixel, `pitch` (mm) wide, of a sum of captures, `clean` without noise."""
     variance = jnp.zeros((), clean[0].dtype)
     for capture, weight, share in zip(clean, weights, exposure, strict=True):
         each = setup.noise.variance(jnp.mean(capture), jnp.var(capture), share)

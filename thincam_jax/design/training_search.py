@@ -86,11 +86,12 @@ class TrainingSettings:
 class TrainedDesigns(eqx.Module):
     """Designs by their training error, best first.
 
-    - `objective`: that was minimised; `landscape`: of it, around the best design.
-    - `found`: with the error as `objective`; `near`: of each, how the error changes around it.
+    - `objective`: objective that was minimised; `landscape`: its values around the best design.
+    - `found`: designs with the error as `objective`; `near`: derivatives of the error around each.
     - `reference`: the error of the space's base.
-    - `evaluations`: of the error, with or without its gradient; `failed`: descents that met NaN.
-    - `pixels`: of the sensor's side in training.
+    - `evaluations`: number of evaluations of the error, with or without its gradient; `failed`:
+      descents that met NaN.
+    - `pixels`: number of pixels of the sensor's side in training.
     """
 
     objective: Objective
@@ -112,9 +113,9 @@ def train_designs(
 ) -> TrainedDesigns:
     """Designs of least training error, by descents from the best of points and even samples.
 
-    - `problem`: of a `TrainingError`, its space and a `Training`.
-    - `points`: of the unit cube, such as those that a search found. The base counts as one more
-      where it keeps the limits.
+    - `problem`: problem of a `TrainingError`, its space and a `Training`.
+    - `points`: starts in the unit cube, such as those that a search found. The base counts as one
+      more where it keeps the limits.
 
     **Errors**: NonFiniteObjectiveError where the error is NaN at every start.
     """
@@ -145,7 +146,7 @@ class TrainingDescents:
         self.ended: list[Search] = []
 
     def descend(self, number: int) -> None:
-        """From the start of that number, if there are so many."""
+        """Run the descent from the start of that number, if there are so many."""
         start = self.starts[number : number + 1]
         if len(start):
             steps = self.settings.steps

@@ -39,7 +39,7 @@ class ModulationTransfer:
 
     - `channels`: root mean square of MTF_c over each ring, for each sum of captures.
     - `chain`: mean of S/(1 + S) over each ring.
-    - `sums`: of each sum, the captures it adds and those it subtracts, from 1.
+    - `sums`: captures that each sum adds and those that it subtracts, numbered from 1.
     """
 
     channels: np.ndarray

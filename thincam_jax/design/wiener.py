@@ -93,7 +93,7 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
 
 
 def _frequencies(training: Training) -> Float[Array, " frequency"]:
-    """Those of the window that are not negative, cycles/rad, the same along v and u."""
+    """Non-negative frequencies of the window, cycles/rad, the same along v and u."""
     window = training.window
     return jnp.asarray(np.fft.rfftfreq(window.samples, window.angle / window.samples), float)
 
@@ -103,7 +103,7 @@ class _Channel(eqx.Module):
 
     - `each`: H, mm², of its captures; `summed`: H d², mm⁴, of their sum.
     - `rows`, `columns`: cos and sin(2πxν/d) of the pixels and frequencies.
-    - `distance`: mm; `weights`, `exposure`: of its captures.
+    - `distance`: mm; `weights`, `exposure`: weight and exposure of each capture.
     """
 
     each: tuple[Float[Array, "v u"], ...]

@@ -36,8 +36,8 @@ class Identity:
 class Connected:
     """A device that is there, unopened.
 
-    - `kind`: "camera", "stage", "display" or "serial port". `driver`, `options`: what a file names
-      it by. `about`: what it is called, or why it cannot be asked.
+    - `kind`: "camera", "stage", "display" or "serial port". `driver`, `options`: names by which a
+      file asks for it. `about`: its own name, or why it cannot be asked.
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""Which devices are connected, and what to write into a file to use them.
+"""Devices that are connected, and the lines of a file that use them.
 
 Looking moves and changes nothing: cameras are read by their descriptors, monitors by the system's
 list, and serial ports stay closed. What is behind a serial port tells only an answer: `ask_port`

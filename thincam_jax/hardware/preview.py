@@ -87,8 +87,8 @@ class Preview:
     - `rig`: its devices, open. `plan`: whose patterns are shown, and whose first settings it begins
       with.
     - `procedure`: settle time and timeout, as of an acquisition; nothing is tried again.
-    - `image`: what is reconstructed of a frame (y, x) of the first pattern, as levels 0 to 1.
-    - `folder`: of the frames that are kept.
+    - `image`: reconstruction of a frame (y, x) of the first pattern, as levels 0 to 1.
+    - `folder`: folder of the frames that are kept.
 
     The error of a device is shown as a line; an unplugged one is opened again.
     """
@@ -172,7 +172,7 @@ class Preview:
         return round(self.values.get("pattern", 0.0))
 
     def _frame(self) -> Frame:
-        """With the devices set to the controls; only what has changed is set."""
+        """Frame taken with the devices set to the controls; only what has changed is set."""
         turned_to = {"exposure": self.values["exposure"] / 1000, "gain": self.values["gain"]}
         asked = dataclasses.replace(self.plan.settings[0], **turned_to)
         if asked != self._asked:

@@ -27,7 +27,7 @@ def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
 def defects(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray, "y x"]:
     """Map of single pixels of one colour that differ from all neighbours as no light does.
 
-    - `step`: of the values, 1 of counts.
+    - `step`: step between values, 1 for counts.
     """
     if min(plane.shape) < 8:
         return np.zeros(plane.shape, bool)

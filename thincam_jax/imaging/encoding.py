@@ -40,8 +40,8 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 def decoded(codes: np.ndarray, tags: Mapping[str, Any], photograph: bool) -> np.ndarray:
     """Light of codes from 0 to 1, by the file's ICC profile, sRGB mark or gamma.
 
-    - `tags`: as of Pillow: `icc_profile`, `srgb`, `gamma`. Without them the codes of a `photograph`
-      are sRGB, others are linear.
+    - `tags`: tags that Pillow reads: `icc_profile`, `srgb`, `gamma`. Without them the codes of a
+      `photograph` are sRGB, others are linear.
     """
     if profile := tags.get("icc_profile"):
         with contextlib.suppress(struct.error, KeyError), np.errstate(all="ignore"):
@@ -65,7 +65,7 @@ def say_once() -> None:
 
 
 def _by_profile(codes: np.ndarray, profile: bytes) -> np.ndarray:
-    """By the curve of red or grey of a profile (ICC.1, 10.6 and 10.18)."""
+    """Light of codes, by a profile's curve of red or grey (ICC.1, 10.6 and 10.18)."""
     (count,) = struct.unpack_from(">I", profile, 128)
     places = range(132, 132 + 12 * min(count, _MOST_TAGS), 12)
     tags = {profile[p : p + 4]: struct.unpack_from(">II", profile, p + 4) for p in places}

@@ -25,7 +25,7 @@ class AbstractIndex(Module):
 
 
 class ConstantIndex(AbstractIndex):
-    """The same index at every wavelength."""
+    """Refractive index without dispersion."""
 
     value: Float[Array, ""]
     band: tuple[float, float] = eqx.field(static=True, default=(0.0, float("inf")))

@@ -158,7 +158,7 @@ class Spectrum(Module):
     def filtered(self, wavelengths: Numbers, transmission: Numbers) -> "Spectrum":
         """This light behind a colour filter, such as one of a sensor's three.
 
-        - `wavelengths`: of the filter's curve, mm, ascending.
+        - `wavelengths`: wavelengths of the filter's curve, mm, ascending.
         - `transmission`: at these, ≥ 0; linear between them, 0 beyond.
         """
         places = checks.wavelengths("wavelengths", checks.array("wavelengths", wavelengths))

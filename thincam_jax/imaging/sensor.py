@@ -51,9 +51,9 @@ class Sensor(Module):
     - `electrons`: in place of `exposure`, an exposure time that is the same for every image: so
       many electrons of a pixel from each mm² of open aperture, the unit of captures, before a
       white scene.
-    - `angular_response`: of the pixels, beside the cosine of their tilted area: n of cosⁿθ, or a
-      table of rows (θ in rad, response) from θ = 0 on. It counts where captures have the light of
-      every point of the field (`PsfMethod(field_tolerance=1.0)`, plans).
+    - `angular_response`: response of the pixels, beside the cosine of their tilted area: n of
+      cosⁿθ, or a table of rows (θ in rad, response) from θ = 0 on. It counts where captures have
+      the light of every point of the field (`PsfMethod(field_tolerance=1.0)`, plans).
     - `bit_depth`: bits of the analogue-digital converter, whose range is the full well; None does
       not quantise. Needs an `exposure` or `electrons`.
 

@@ -77,7 +77,7 @@ def read_arrays(path: str | os.PathLike[str], like: Any) -> Any:
 
 
 def read_weights(path: str | os.PathLike[str], like: Any) -> Any:
-    """As `read_arrays`, as arrays of JAX; CheckpointError where numbers are not finite, too."""
+    """Read weights as arrays of JAX; CheckpointError also where they are not finite."""
     weights = read_arrays(path, like)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights)):
         raise CheckpointError(f"{path}: holds weights that are not finite; give an earlier file")

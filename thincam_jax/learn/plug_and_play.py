@@ -123,7 +123,7 @@ class PlugAndPlay(AbstractIterativeSolver):
       their noise's deviation.
     - `strength`: σ relative to the one found; more gives smoother images, less leaves noise.
     - `nonnegative`: whether to constrain f ≥ 0.
-    - `synthesis`: as of `AdmmTV`.
+    - `synthesis`: weights of the captures, see `AdmmTV`.
     - `iterations`: data steps after the first one, in which s falls. Up to eight more follow
       where the residual is still over three times the noise, as of very bright captures.
     - `tolerance`: change in the last one, relative to an image's length, that counts as converged.
@@ -283,7 +283,7 @@ class _Run:
 
     @property
     def problem(self) -> InverseProblem:
-        """In units of which A has the norm 1."""
+        """Inverse problem in units in which A has the norm 1."""
         return self.normal.problem
 
     def _noise(self) -> ResidualNoise:

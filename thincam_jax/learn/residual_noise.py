@@ -38,8 +38,9 @@ class ResidualNoise(eqx.Module):
 
     - `mistake`: its deviation where there is most of it, as in bright parts; 1 where the data step
       leaves too little to tell.
-    - `grows`: whether it grows with the light, and `variances`: of each pixel, over that of one of
-      mean light; False and none where the operators are no convolutions, or captures small.
+    - `grows`: whether it grows with the light, and `variances`: variance of each pixel, over that
+      of one of mean light; False and none where the operators are no convolutions, or captures
+      small.
     """
 
     mistake: Float[Array, ""]
@@ -51,7 +52,7 @@ class ResidualNoise(eqx.Module):
 def residual_noise(
     normal: AbstractNormal, found: Image, shift: Float[Array, ""], precision: Float[Array, ""]
 ) -> ResidualNoise:
-    """From the residual of z, a data step with μ = `shift` and 1/variance = `precision`."""
+    """Noise from the residual of z, a data step with μ = `shift` and 1/variance = `precision`."""
     problem = normal.problem
     keys = jax.random.split(jax.random.key(0), len(problem.captures))
     drawn = tuple(
@@ -113,7 +114,7 @@ def _has_parts(operator: AbstractOperator) -> bool:
 
 
 def _means_of_parts(problem: InverseProblem, values: list[Array]) -> Array:
-    """Over captures, their batch and parts, _PARTS along each axis; over all of small captures."""
+    """Means over captures, apart by batch and, unless they are small, _PARTS along each axis."""
     means = []
     for operator, value in zip(problem.operators, values, strict=True):
         if not _has_parts(operator):

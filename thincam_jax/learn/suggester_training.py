@@ -67,8 +67,10 @@ class SuggesterTraining:
 
     - `samples`: designs, sampled evenly, whose levels are the examples.
     - `guesses`, `width`, `depth`: points that the network gives, and its hidden layers.
-    - `warm_up`, `steps`: of the two parts; a tandem step costs some 8·`batch` responses.
-    - `rate`: of Adam, falling to zero as a cosine in each part; the tandem begins at a tenth.
+    - `warm_up`, `steps`: numbers of steps of the two parts; a tandem step costs some 8·`batch`
+      responses.
+    - `rate`: step size of Adam, falling to zero as a cosine in each part; the tandem begins at a
+      tenth.
 
     **Errors**: ValueError for numbers below 1, and for a rate that is not positive.
     """
@@ -158,7 +160,7 @@ def _train(suggester: Suggester, points, levels, key, rate, settings: SuggesterT
 
 
 def _chosen_misfits(model: ResponseModel, guesses, target, key) -> Float[Array, " target"]:
-    """Of the best guess of each target, or now and then of any; only these are differentiated."""
+    """Misfit of each target's best guess, or now and then of any; only this is differentiated."""
     judged = jax.vmap(jax.vmap(model.misfit, in_axes=(0, None)))(
         jax.lax.stop_gradient(guesses), target
     )

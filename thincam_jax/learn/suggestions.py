@@ -54,8 +54,9 @@ _DAMPINGS = (0.01, 0.3, 10.0)
 class Suggester(eqx.Module):
     """A network from target levels to guesses in the unit cube, and the model that judges them.
 
-    - `layers`: of a multilayer perceptron, SiLU between them, a sigmoid at the end.
-    - `mean`, `scale`: of the levels it was trained on, dB; it sees (target − mean)/scale.
+    - `layers`: layers of a multilayer perceptron, SiLU between them, a sigmoid at the end.
+    - `mean`, `scale`: mean and scale of the levels it was trained on, dB; it sees (target −
+      mean)/scale.
     - `model`: space, setup, synthesis and frequencies it was trained for.
     - `guesses`: how many points it gives.
 
@@ -171,8 +172,8 @@ class Suggestion(Module):
 
     - `design`; `values`: its free numbers, in the order of the space's variables.
     - `misfit_db`: root mean square over the rings of what its levels differ from the target, dB.
-    - `network_misfit_db`: the same of the network's best guess, before the Gauss–Newton steps.
-    - `levels`: what the design gives, dB.
+    - `network_misfit_db`: misfit of the network's best guess, before the Gauss–Newton steps.
+    - `levels`: levels that the design gives, dB.
     - `active`: the limits it lies against, in words.
     - `status`: "matched" within the tolerance; "not_attained": no design was found that gives
       the target, and there may be none; "non_finite": no guess has a response.

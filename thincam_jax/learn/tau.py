@@ -28,7 +28,8 @@ def learn_tau(
     differentiation (`solve_fixed_point`). Returns c and the mean before each step of Adam.
 
     - `problems`: with their τ. `images`: the true one of each.
-    - `steps`, `rate`: of Adam on ln c. `iterations`: of ADMM for each image.
+    - `steps`, `rate`: number and size of the steps of Adam on ln c. `iterations`: number of
+      iterations of ADMM for each image.
 
     **Errors**: ValueError for other numbers of images than problems, and out of range.
     """

@@ -43,11 +43,11 @@ TrainingStatus = Literal["finished", "stopped", "diverged"]
 class TrainingOptions:
     """Length and rate of a training.
 
-    - `steps`, `seed`: of the training.
-    - `rate`: of Adam; it rises over `warm_up` steps and falls to zero as a cosine, over the last
-      `falling` part of the steps.
+    - `steps`, `seed`: number of steps of the training, and its seed.
+    - `rate`: step size of Adam; it rises over `warm_up` steps and falls to zero as a cosine, over
+      the last `falling` part of the steps.
     - `longest_slope`: norm to which longer gradients are shortened.
-    - `averaging`: what is judged and kept is a running mean of the weights over some
+    - `averaging`: decay of the running mean of the weights, which is judged and kept, over some
       1/(1 − averaging) steps; 0: the weights themselves.
     - `check_every`: steps between two states that are judged and kept.
 
@@ -67,7 +67,7 @@ class TrainingOptions:
         check_fields(self)
 
     def rate_at(self, step: int) -> float:
-        """Of the step of that number, counted from 0."""
+        """Step size of the step of that number, counted from 0."""
         rising = min(1.0, (step + 1) / (self.warm_up + 1))
         place = max(0.0, (step / self.steps - 1 + self.falling) / self.falling)
         return self.rate * rising * 0.5 * (1 + math.cos(math.pi * place))
@@ -81,7 +81,8 @@ class Task:
     - `loss`: (model, examples) → a number and a dictionary of its parts, for `grad`, at module
       level; it is compiled once.
     - `validation`: examples whose mean loss judges the model.
-    - `learned`: what of the model is trained, as of `equinox.filter`; by default floating arrays.
+    - `learned`: part of the model that is trained, a filter of `equinox.filter`; by default
+      floating arrays.
     """
 
     draw: Callable[[Any], Any]
@@ -95,7 +96,8 @@ class TrainingState(eqx.Module):
 
     - `weights`, `optimiser`: after `step` steps; `averaged`, `best`: the running mean, and the one
       with the lowest score.
-    - `losses`: of each step, NaN for those to come and for what was none; `scores`: of each check.
+    - `losses`: loss of each step, NaN for those to come and for what was none; `scores`: score of
+      each check.
     - `skipped`: steps that changed nothing; `retreats`: how often the rate was halved.
     """
 
@@ -116,7 +118,7 @@ class TrainingState(eqx.Module):
 
     @classmethod
     def begin(cls, model: Any, task: Task, options: TrainingOptions) -> "TrainingState":
-        """Before the first step."""
+        """State before the first step."""
         # A plain number's weak type would be compiled for once more: steps return none.
         weights = jax.tree.map(
             lambda x: jax.lax.convert_element_type(x, x.dtype), eqx.filter(model, task.learned)
@@ -167,8 +169,8 @@ def train_model(
 
     **Arguments**
 
-    - `state`: what to go on from, as `keep` was given it; the result has the same bits as
-      without the interruption, on one machine.
+    - `state`: state to go on from, as `keep` was given it; the result has the same bits as without
+      the interruption, on one machine.
     - `keep`: called with every state that is worth to be kept, at each check.
     - `callback`: called after every step; a true answer stops.
 
@@ -249,7 +251,7 @@ def _lowest(state: TrainingState) -> float:
 def _judged(
     task: Task, fixed: Any, state: TrainingState, losses: np.ndarray, options: TrainingOptions
 ) -> TrainingState:
-    """With its score, and as the best where it is; without validation the last is the best."""
+    """State with its score, and as the best where it is; without validation, the last one is."""
     values = [_score(task.loss, fixed, state.averaged, one) for one in task.validation]
     score = float(np.mean(values)) if values else math.nan
     scores, best = state.scores.copy(), state.best

@@ -1,4 +1,4 @@
-"""From a scene to what the camera captures."""
+"""Captures of a scene by a camera."""
 
 import functools
 import operator

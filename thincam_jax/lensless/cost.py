@@ -37,7 +37,7 @@ class Cost:
     bytes: int
 
     def times(self, count: int) -> "Cost":
-        """The same evaluation `count` times, one after another."""
+        """Cost of `count` evaluations, one after another."""
         return Cost(self.flops * count, self.bytes)
 
 
@@ -67,7 +67,7 @@ def _sampled(shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
 
 
 def _radial(mask: RadialMask, shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
-    """Of the discs' fields at the samples of the profile, or at all points of all pixels."""
+    """Operations and numbers held for the discs' fields at a profile's or all pixels' samples."""
     pixels, points = math.prod(shape), (method.nodes or 1) if method.pixel_integration else 1
     at_once = profile_length(shape, method.oversampling) if method.oversampling else pixels
     discs = at_once * (1 if method.oversampling else points)
@@ -75,7 +75,7 @@ def _radial(mask: RadialMask, shape: tuple[int, int], method: PsfMethod) -> tupl
 
 
 def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
-    """The same for the models that are a short sum of products of one-dimensional factors."""
+    """Operations and numbers held by models that are a short sum of separable terms."""
     if not isinstance(mask, AbstractFactoredMask):  # a geometric shadow, sampled
         return 4.0 * math.prod(shape), 2.0 * math.prod(shape)
     length = sum(shape)

@@ -99,10 +99,10 @@ class Exposures(Module):
     - `beta`: β of the mask, rad/mm²; 0 for a mask without zones.
     - `distance`: mask to sensor, mm.
     - `phase`: initial phase φ of the mask, rad.
-    - `wavelength`: mm. `width`: of the mask along x, mm.
+    - `wavelength`: mm. `width`: width of the mask along x, mm.
     - `relative_time`: exposure time over the sensor's own.
-    - `profile`: of a zone plate, see `FresnelZoneAperture`; None is that of the mask given to
-      `cameras`.
+    - `profile`: profile of a zone plate, see `FresnelZoneAperture`; None is that of the mask given
+      to `cameras`.
     - `take`: number of the exposure among those with the same settings, each with noise of its own;
       by default they are counted.
     - `moves`: x of the object's middle at the beginning and the end of each, mm; see `ImagePlane`.
@@ -231,7 +231,7 @@ class Exposures(Module):
         return self.at_phases(PAIR)
 
     def of_moving(self, speed: float) -> "Exposures":
-        """The same of an object that moves, one exposure after another without a pause.
+        """These exposures of an object that moves, one after another without a pause.
 
         `speed`: mm to +x during an exposure of the sensor's own time. Half way through all
         exposures the object is on the axis.

@@ -43,7 +43,7 @@ def field_operator(
     tolerance: float = 1e-2,
     model: Model | PsfMethod = "separable",
 ) -> LowRankFit:
-    r"""From a plane of the object to its capture, every point with its own PSF and light.
+    r"""Operator from a plane of the object to its capture: each point has its own PSF and light.
 
     The PSFs of a grid of points, each about the ray through the mask's middle, are written as that
     of the axis and the fewest convolutions for its changes, :math:`h(\mathbf x; \mathbf u) =
@@ -61,8 +61,8 @@ def field_operator(
       polynomials, a quarter by the averages over pixels and the rest by the sum of convolutions.
       Where pixels hold some 200 fringes, averages leave more, which is reported. With 1 the PSF is
       that of the axis, and the light that of every point: that serves most captures, see `plan`.
-    - `model`: of the PSFs, averaged over the pixels, see `psf`. Cells off both axes are sampled,
-      with more samples by `PsfMethod("angular_spectrum", oversampling=...)`.
+    - `model`: model of the PSFs, averaged over the pixels, see `psf`. Cells off both axes are
+      sampled, with more samples by `PsfMethod("angular_spectrum", oversampling=...)`.
 
     **Returns** the operator and its two errors. Numbers must be known: call it outside of jit.
 
@@ -151,7 +151,7 @@ def _averages(
 def tangents_of(
     camera: LenslessCamera, field_shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " n"]]:
-    """Of the angles of the field's rows and columns, of the rays through the mask's (0, 0)."""
+    """Tangents of the angles of the field's rows and columns, of rays through the mask's origin."""
     step = float(camera.sensor.pitch) / float(camera.distance)
     rows, columns = ((np.arange(n) - (n - 1) / 2) * step for n in field_shape)
     return rows, columns

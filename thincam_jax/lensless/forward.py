@@ -1,4 +1,4 @@
-"""From one plane of a scene to its noise-free image on the sensor."""
+"""Noise-free image of one plane of a scene on the sensor."""
 
 import functools
 import math
@@ -75,7 +75,7 @@ def operator_of(
     field_shape: tuple[int, int],
     method: PsfMethod,
 ) -> CropConvolution | LowRank:
-    """The same of (wavelength, weight) pairs, by a method."""
+    """Operator from a plane's projection to its capture, for (wavelength, weight) pairs."""
     if method.field_tolerance is not None:
         return field_fit(camera, colours, object_distance, field_shape, method).operator
     grid = camera.sensor.grid

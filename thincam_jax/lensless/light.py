@@ -58,9 +58,10 @@ def shading(
     baffle that shades a part of the mask takes that part's light, too.
 
     - `down`, `across`: tangents of the angles of the scene's rows and columns, (y, x)/t.
-    - `depth`: of the walls of a mask's openings (its thickness), or from a baffle to the mask, mm.
+    - `depth`: depth of the walls of a mask's openings (its thickness), or distance from a baffle to
+      the mask, mm.
     - `opening`: width of the first edge, mm: of a mask's openings, or of the baffle.
-    - `width`: of what lies behind, mm: of the mask, for a baffle; by default that of the opening.
+    - `width`: width of the area behind, mm: the mask, for a baffle; by default that of the opening.
 
     ```python
     import numpy as np

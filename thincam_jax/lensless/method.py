@@ -108,11 +108,11 @@ class PsfMethod:
     - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
       smallest that does. Inside jit and grad, where the mask's size is not known, it is the
       sensor's: give it there if the mask is wider than the sensor.
-    - `nodes`: of the pixel average of "separable"; by default counted (`psf`). Gauss nodes an axis,
-      or, for a mask of more than 128 terms and for "radial", points a pixel (21 by default).
-    - `field_tolerance`: of captures: how far, relative, the PSFs of points off the axis may be from
-      their own, which change over the field as does their light (`field_operator`). By default all
-      points have the PSF and the light of the axis.
+    - `nodes`: nodes of the pixel average of "separable"; by default counted (`psf`). Gauss nodes an
+      axis, or, for a mask of more than 128 terms and for "radial", points a pixel (21 by default).
+    - `field_tolerance`: tolerance of captures: how far, relative, the PSFs of points off the axis
+      may be from their own, which change over the field as does their light (`field_operator`). By
+      default all points have the PSF and the light of the axis.
 
     ```python
     import thincam_jax as tc

@@ -1,4 +1,4 @@
-"""From a camera to its point spread function and optical transfer function."""
+"""Point spread function and optical transfer function of a camera."""
 
 import functools
 import math
@@ -264,7 +264,7 @@ def sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMeth
 
 
 def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
-    """In the method's precision; the result comes back in the camera's."""
+    """Value of a function in the method's precision, returned in the camera's."""
     mask, grid = camera.mask, camera.sensor.grid
     tolerance = AVERAGES * (method.field_tolerance or 0.0)
     given, own = method, precision_of(grid.pitch)

@@ -49,10 +49,11 @@ def separable_operator(
 
     - `scene`: one plane, for the numbers of its image's pixels, its width and distance, and the
       light. The image itself plays no part.
-    - `tolerance`: what may be missed of captures of white scenes, relative Frobenius norm. The
+    - `tolerance`: part of captures of white scenes that may be missed, relative Frobenius norm. The
       uniform light is part of them: `operator.centred().truncated(…)` counts what is left without.
       Inside jit and grad, where their number cannot follow from it, all terms are kept.
-    - `model`, `pixel_integration`: of the PSF, see `thincam_jax.psf`: one with separable terms.
+    - `model`, `pixel_integration`: settings of the PSF, see `thincam_jax.psf`: one with separable
+      terms.
 
     **Returns** the operator, its error, and the errors of fewer terms.
 

@@ -70,7 +70,7 @@ def demosaiced(
 def mosaic(
     colours: Shaped[np.ndarray, "*batch 3 y x"], pattern: Pattern
 ) -> Shaped[np.ndarray, "*batch y x"]:
-    """What a sensor with a pattern measures of red, green and blue light."""
+    """Mosaic of red, green and blue light that a sensor with a pattern measures."""
     sites = np.stack(list(colour_sites(colours.shape[-2:], pattern).values()))
     return np.where(sites, colours, 0).sum(axis=-3)
 

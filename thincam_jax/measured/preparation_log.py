@@ -9,7 +9,7 @@ from thincam_jax.measured.options import Preparation
 class ImageLog:
     """One image before its channels and pixels were changed.
 
-    - `name`, `format`, `shape`, `bits`, `full_scale`: of its file.
+    - `name`, `format`, `shape`, `bits`, `full_scale`: properties of its file.
     - `minimum`, `maximum`: in counts. `pixels_at_maximum`: many have saturated, whatever the
       converter's highest level.
     - `background`: source of `level`, what was subtracted, the mean of each channel in fractions of
@@ -61,14 +61,14 @@ class Centring:
 
 @dataclass(frozen=True)
 class PreparationLog:
-    """What `prepare` did; `dataclasses.asdict` gives it for a JSON file.
+    """Record of the steps of `prepare`; `dataclasses.asdict` gives it for a JSON file.
 
     - `psf`, `capture`: the images as they were read. `valid_share`: trusted pixels of the capture.
-    - `psf_shape`: of the PSF on the capture's pixels, before `downsample`.
+    - `psf_shape`: shape of the PSF on the capture's pixels, before `downsample`.
     - `first_pixel`, `cropped_to`: part of the capture that whole blocks of `downsample` cover;
       `shape`: after them.
     - `noise`: standard deviation of the PSF's pixels, for each channel.
-    - `psf_divisor`, `capture_divisor`: of fractions of full scale.
+    - `psf_divisor`, `capture_divisor`: divisors of fractions of full scale.
     """
 
     options: Preparation

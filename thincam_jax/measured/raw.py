@@ -29,11 +29,11 @@ class Raw:
       10, 12 and 14 bit cameras fill the low bits of 16: give `bits`, or full scale is 16 bit.
     - `format`: "tiff", "png", "npy", or "array".
     - `name`: in messages; the path of the file.
-    - `sensor_shape`: of a PSF that was computed also beyond the sensor, that of the sensor.
-    - `bayer`, `black_level`, `white_level`: as its file says them, counts; None where it does not.
-      The white level is then the full scale.
-    - `exposure`: s, by its file. `saturation`: count from which pixels are saturated, where that is
-      below full scale.
+    - `sensor_shape`: shape of the sensor, for a PSF that was computed also beyond it.
+    - `bayer`, `black_level`, `white_level`: pattern and levels (counts) that its file names; None
+      where it does not. The white level is then the full scale.
+    - `exposure`: time by its file, s. `saturation`: count from which pixels are
+      saturated, where that is below full scale.
     - `dead`: map (y, x) of pixels that are NaN or masked; they are 0 in `pixels`. None: no such.
 
     **Errors**: MeasurementError for another shape or type, an empty image, infinite values, no

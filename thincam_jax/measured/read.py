@@ -228,7 +228,7 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Fa
 
 
 def _true_name(path: Path) -> str:
-    """What a file is that is not read, and the line of Python that brings it in."""
+    """Kind of a file that is not read, and the line of Python that brings it in."""
     with open_regular(path) as (file, _):
         start = file.read(12)
     array = f"numpy.save({str(path.with_suffix('.npy'))!r}"
@@ -353,7 +353,7 @@ def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], _Facts]:
 
 
 def _tiff_facts(page: tifffile.TiffPage) -> _Facts:
-    """By the tags of TIFF and DNG."""
+    """Facts about an image by the tags of TIFF and DNG."""
     bits, facts = page.bitspersample, {"orientation": page.tags.valueof(ORIENTATION, 1)}
     exif = page.tags.valueof(_EXIF, {}) or {}
     facts |= _exposure(exif.get("ExposureTime"), page.tags.valueof(_EXPOSURE_TIME))

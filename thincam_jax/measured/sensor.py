@@ -48,9 +48,9 @@ class SensorCalibration:
     - `defective`: pixels that are hot, dead, or unlike their neighbours in level or noise.
     - `conversion_gain`: K, counts per electron. `read_noise`: in electrons; without a rate, with
       that of the dark current.
-    - `photon_transfer`: of each level, mean light, counts, additional variance and its error.
-    - `line_noise`: of rows and columns, electrons, beside the read noise. `bend`: change of V/Y up
-      to the brightest level, relative. Both 0 if not seen.
+    - `photon_transfer`: mean light, counts, additional variance and its error at each level.
+    - `line_noise`: noise of rows and columns, electrons, beside the read noise. `bend`: change of
+      V/Y up to the brightest level, relative. Both 0 if not seen.
     - `_error`: standard error. All hold for one gain, black level, format, binning and region.
     """
 
@@ -80,7 +80,7 @@ class SensorCalibration:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """What contradicts the errors, or what the frames cannot show, and what to do."""
+        """Findings that contradict the errors or that frames cannot show, and what to do."""
         levels, most = len(self.photon_transfer), 0.5 / self.conversion_gain
         flat = self.read_noise < most and self.dark_level[~self.defective].std() < 0.55
         found = {
@@ -156,8 +156,8 @@ def measure_sensor(
 
     - `series`: exposures, as `Acquisition.exposed` reads them; several show the dark current.
     - `outlier`: difference from the neighbours, in standard deviations, of a defective pixel.
-    - `mosaic`: of a Bayer pattern: the mean response is 1 at each of its four places, so that the
-      colour of the light has no effect.
+    - `mosaic`: whether the sensor has a Bayer pattern: the mean response is 1 at each of its four
+      places, so that the colour of the light has no effect.
 
     With the means :math:`Y_j` of light over all good pixels, and :math:`V_j` of the variance of lit
     minus that of dark frames, :math:`K = \sum_j w_j V_j / \sum_j w_j Y_j`, unbiased for any

@@ -51,7 +51,7 @@ def landscape(
 
     - `values`: (down, across); values that are not finite stay white.
     - `across`, `down`: the parameters' values, ascending.
-    - `labels`: of both axes and of the values, with units: ("β₁ (rad/mm²)", "β₂ (rad/mm²)",
+    - `labels`: labels of both axes and of the values, with units: ("β₁ (rad/mm²)", "β₂ (rad/mm²)",
       "error (dB)").
 
     **Errors**: ValueError where the shapes do not fit, or no value is finite.
@@ -78,7 +78,7 @@ def landscape(
 def front(points: "Sequence[FrontPoint]", cost: str) -> Figure:
     """Resolution and error of the points of a front over their cost; hollow ones are dominated.
 
-    - `points`: as of `tc.design.find_front`. `cost`: label of the cost, "thickness (mm)".
+    - `points`: result of `tc.design.find_front`. `cost`: label of the cost, "thickness (mm)".
     """
     from thincam_jax.design.fronts import non_dominated
 

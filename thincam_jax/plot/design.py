@@ -149,7 +149,7 @@ def draw_objective(result: FoundDesigns, count: int, figure: Figure | None = Non
 
 
 def draw_training(result: FoundDesigns, count: int) -> Figure | None:
-    """The same of the training error; None without training."""
+    """The training error over the free numbers, with designs; None without training."""
     if result.training is None:
         return None
     designs = (result.reference, *result.found[:count])
@@ -163,7 +163,7 @@ def _marked(
     costs: list[tuple[RankedDesign, float, float]],
     figure: Figure | None = None,
 ) -> Figure | None:
-    """With designs, each with the cost where it is drawn, and that of the legend."""
+    """Figure with designs, each with the cost where it is drawn, and that of the legend."""
     if landscape is None:
         return None
     names = [f"{one.name} ({float(landscape.reported(c)):.2f} {unit})" for one, _, c in costs]
@@ -237,14 +237,14 @@ def _draw_transfer(ax: Axes, one: RankedDesign, transfer: ModulationTransfer, ed
 
 
 def _sum_label(shot: Shot, sums: tuple[tuple[int, ...], tuple[int, ...]]) -> str:
-    """Of a sum of captures: "captures 1 − 2: β 25 rad/mm² at 6.5 mm"."""
+    """Label of a sum of captures: "captures 1 − 2: β 25 rad/mm² at 6.5 mm"."""
     added, taken = (" + ".join(str(n) for n in part) for part in sums)
     formula = f"{added} − {taken.replace('+', '−')}" if taken else added
     return f"captures {formula}: β {shot.beta:.4g} rad/mm² at {shot.distance:.3g} mm"
 
 
 def _at(distance: float) -> tuple[Callable, Callable]:
-    """From angular frequencies to those on a plane at a distance, and back."""
+    """Conversions of angular frequencies to those on a plane at a distance, and back."""
     return lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance
 
 

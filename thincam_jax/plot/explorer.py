@@ -54,7 +54,7 @@ class View:
       frequencies, to the next; without zero frequency, which is the background's.
     - `cut_off`: cycles/mm, where it ends. `zero`: at rest, the first that a zone aperture's fringe
       scanning cannot carry; None where there is none.
-    - `values`: of the controls. `lines`: sentences about the setting, at rest.
+    - `values`: values of the controls. `lines`: sentences about the setting, at rest.
     """
 
     values: dict[str, float]

@@ -45,7 +45,7 @@ def show_image(axes: Axes, image: Any, pitch: float | None, **options: Any) -> A
     """Draw an image (y, x) or (y, x, 3) on axes in mm about its middle, +y down.
 
     - `pitch`: distance of its pixels, mm; None: axes count pixels.
-    - `options`: of `matplotlib.axes.Axes.imshow`.
+    - `options`: options of `matplotlib.axes.Axes.imshow`.
     """
     image = np.asarray(image)
     rows, columns = (n * (pitch or 1) / 2 for n in image.shape[:2])
@@ -91,7 +91,7 @@ def drawing(
 ) -> Any:
     """A figure of a size in inches, the one given or a new one, and its axes.
 
-    `how`: as of `Figure.subplots`.
+    `how`: options of `Figure.subplots`.
     """
     figure = matplotlib.figure.Figure() if figure is None else figure
     figure.set_size_inches(*size)

@@ -20,7 +20,7 @@ def draw_frames(
 ) -> Figure:
     """Frames in counts on the sensor, all on one grey scale.
 
-    - `pitch`: of the sensor's pixels, mm.
+    - `pitch`: pitch of the sensor's pixels, mm.
     - `lit`: pixels that see light, which set the scale; default all.
     """
     seen = frames if lit is None else frames[:, lit]
@@ -31,7 +31,7 @@ def draw_frames(
 def draw_patterns(shown: Sequence[np.ndarray], labels: Sequence[str], pitch: float) -> Figure:
     """Patterns (y, x) that a display showed, levels 0 to 255, where any of them is lit.
 
-    - `pitch`: of the display's pixels, mm.
+    - `pitch`: pitch of the display's pixels, mm.
     """
     lit = np.argwhere(np.max(shown, axis=0))
     middle = np.array(shown[0].shape) / 2
@@ -69,7 +69,8 @@ def draw_images(
 ) -> Figure:
     """Images on the object, each from its own black to its own white.
 
-    - `pitch`: of their pixels, mm. `scores`: PSNR, dB, by their names, of those that have one.
+    - `pitch`: pitch of their pixels, mm. `scores`: PSNR, dB, by their names, of those that have
+      one.
     """
     figure, axes = drawing((4.2 * len(images), 4.7), 1, len(images), squeeze=False)
     for ax, (name, image) in zip(axes[0], images.items(), strict=True):

@@ -88,7 +88,7 @@ def draw_result(result: ScreenResult, rays: wg.Rays) -> dict[str, Figure]:
 
 
 def captions(study: ScreenStudy) -> dict[str, str]:
-    """Of the figures of a study, by their names."""
+    """Captions of the figures of a study, by their names."""
     lens = study.mask is None
     turned = "in the colours of its pixels, turned upright" if lens else "turned upright"
     return {

@@ -25,8 +25,8 @@ _QUANTITIES["phases"] = _QUANTITIES["phase"]
 def draw_sweep(rows: list[dict], axes: Sequence[str], methods: dict[str, str]) -> Figure:
     """A panel of lines for each axis; of two axes also maps of methods that change along both.
 
-    - `rows`: of the points, by column. `axes`: the columns of swept values, whose last word says
-      their quantity, as `methods.0.shots.0.beta` in rad/mm².
+    - `rows`: results of the points, by column. `axes`: the columns of swept values, whose last word
+      says their quantity, as `methods.0.shots.0.beta` in rad/mm².
     - `methods`: the column of each method's mean PSNR, dB.
     """
     changing = [m for m in methods.items() if all(_changes(rows, p, axes, m[1]) for p in axes)]

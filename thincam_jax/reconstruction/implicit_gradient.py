@@ -110,7 +110,8 @@ def solve_fixed_point(
     **Arguments**
 
     - `problem`: or its splitting, such as `splitting_of(problem).with_penalties(…)`.
-    - `iterations`: at most; `tolerance`: of the relative change of the state, see `Admm`.
+    - `iterations`: highest number of iterations; `tolerance`: relative change of the state at which
+      they end, see `Admm`.
     - `relaxation`: α of `thincam_jax.reconstruction.admm`.
     - `adjoint`: the linear solver of the gradient, default `NeumannSeries()`.
 

@@ -44,7 +44,7 @@ class Residuals:
 class Progress:
     """Progress of a run, for its callback and its history.
 
-    - `objective`: of the image, summed over a batch.
+    - `objective`: objective of the image, summed over a batch.
     - `primal`, `dual`: relative residuals, see the method; NaN if it has none.
     """
 
@@ -57,7 +57,7 @@ class Progress:
 class Outcome(eqx.Module):
     """The image with the lowest objective among those checked, and the history of the run.
 
-    - `reason`: what the user should know of the result; "" for nothing.
+    - `reason`: note about the result for the user; "" for none.
     """
 
     image: Image
@@ -284,9 +284,9 @@ def outcome_of_run(
 ) -> Outcome:
     """Outcome of a run in one compiled program, without progress.
 
-    As of `iterate`, the image is the start if the result is not finite.
+    As with `iterate`, the image is the start if the result is not finite.
 
-    - `objectives`: of both images, summed over a batch here.
+    - `objectives`: objectives of both images, summed over a batch here.
     - `began`: `time.perf_counter()` at the start.
     """
     nan = math.nan

@@ -250,8 +250,8 @@ class AdmmTV(AbstractRegularised):
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: sums of captures in place of the captures, see
       `thincam_jax.reconstruction.synthesis`; for `Cameras` only.
-    - `iterations`: at most. `tolerance`: of the relative residuals; a tenth of a percent, ten times
-      as much, of the objective over 20 iterations ends them as well.
+    - `iterations`: at most. `tolerance`: relative residuals at which they end; a tenth of a
+      percent, ten times as much, of the objective over 20 iterations ends them as well.
 
     **Errors**: ValueError, one line, for values out of range.
 
@@ -310,7 +310,7 @@ class AdmmTV(AbstractRegularised):
         return float(rough._from_nothing(problem, image, None).history[-1].objective)
 
     def _by_levels(self, problem, image, callback, levels: int) -> Outcome:
-        """On pixels up to `levels` times halved; the last begins as `_from_nothing` does."""
+        """Outcome by way of pixels up to `levels` times halved, which begin by `_from_nothing`."""
         coarse = coarser(problem, image) if levels else None
         if coarse is None:
             return self._from_nothing(problem, image, callback)
@@ -323,7 +323,7 @@ class AdmmTV(AbstractRegularised):
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
 
     def _from_nothing(self, problem, image, callback) -> Outcome:
-        """From a uniform or black image; a biased camera begins without its uniform light."""
+        """Outcome from a uniform or black image; a biased camera's begins without uniform light."""
         lit = bool(jnp.any(image != 0))
         first = self._without_uniform_light(problem, image, callback) if lit else None
         if first is None:

@@ -184,7 +184,7 @@ def estimate_variance(
 
 @jax.jit
 def _variances(deviations, captures):
-    """Their squares; a thousandth of the root mean square of all captures in place of 0."""
+    """Variances of deviations; (root mean square of all captures / 1000)² in place of 0."""
     found = jnp.stack([jnp.mean(d**2) for d in deviations])
     least = 1e-6 * jnp.mean(jnp.stack([jnp.mean(c**2) for c in captures]))
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))

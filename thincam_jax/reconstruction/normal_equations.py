@@ -124,7 +124,7 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
 
 
 class DenseNormal(AbstractNormal):
-    """By the Cholesky factor of the Gram matrix (pixel, pixel) plus μ."""
+    """Solutions by the Cholesky factor of the Gram matrix (pixel, pixel) plus μ."""
 
     gram: Float[Array, "n n"]
     factor: Float[Array, "n n"]
@@ -147,7 +147,7 @@ class DenseNormal(AbstractNormal):
 
 
 class SeparableNormal(AbstractNormal):
-    """By the modes of a separable camera, weight and gain included in their values."""
+    """Solutions by the modes of a separable camera, weight and gain included in their values."""
 
     modes: SeparableModes
 
@@ -160,7 +160,7 @@ class SeparableNormal(AbstractNormal):
 
 
 class ReducedNormal(AbstractNormal):
-    """By the eigenvectors of a reduced matrix, for any μ."""
+    """Solutions by the eigenvectors of a reduced matrix, for any μ."""
 
     def solve(self, right: Float[Array, "..."]):
         bare, power = self._powers()
@@ -186,7 +186,7 @@ class ReducedNormal(AbstractNormal):
 
 
 class InverseNormal(AbstractNormal):
-    """By the inverse matrix itself: one product a solution."""
+    """Solutions by the inverse matrix itself: one product each."""
 
     inverse: Float[Array, "n n"]
 
@@ -199,7 +199,7 @@ class InverseNormal(AbstractNormal):
 
 
 class IterativeNormal(AbstractNormal):
-    """By conjugate gradients to `INNER_TOLERANCE`.
+    """Solutions by conjugate gradients to `INNER_TOLERANCE`.
 
     Convolutions are preconditioned by their `mean_powers`, separable cameras by the `modes` given.
     """

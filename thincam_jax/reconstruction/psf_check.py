@@ -54,8 +54,9 @@ _KEPT = 0.8  # of a PSF's variance, by blocks that are fine enough
 class PsfCheck:
     """Result of `check_psf`.
 
-    - `orientation`: of the best fit relative to the PSF given; turns are anticlockwise.
-    - `scale`: of the PSF that fits best over the one given; `scale_error`: its standard error.
+    - `orientation`: orientation of the best fit relative to the PSF given; turns are anticlockwise.
+    - `scale`: size of the PSF that fits best over that of the one given; `scale_error`: its
+      standard error.
     - `scales`, `objectives`: the profile: scales tried in the best orientation, and the lowest
       objective at each, relative to the lowest of all.
     - `noise_ratio`: rms of the residual of the best PSF over the noise; near 1 it explains all.
@@ -167,7 +168,7 @@ def check_psf(
       reconstructions are made: average blocks of pixels until the longer side is 100 to 200, or 300
       where these would blur the PSF.
     - `search`: range of the scale about 1, at most 0.5.
-    - `tau`: as of `AdmmTV`.
+    - `tau`: weight of total variation, relative to the noise; see `AdmmTV`.
     - `callback`: called with the number of PSFs tried and their total.
 
     **Errors**: ValueError, one line, for recordings without measured PSFs, and numbers out of

@@ -148,7 +148,7 @@ def refine(
       are made.
     - `parameters`: names of the above; default all.
     - `search`: range of scale and distances about those given, at most 0.2.
-    - `tau`: as of `AdmmTV`.
+    - `tau`: weight of total variation, relative to the noise; see `AdmmTV`.
     - `callback`: called with the number of reconstructions done.
 
     **Errors**: ValueError, one line, for recordings without PSFs or cameras, and numbers out of

@@ -21,9 +21,9 @@ class Reconstruction(Module):
     - `history`: objective and residuals along the way; see `Progress`.
     - `iterations`, `seconds`: done and taken; compilation is part of the time.
     - `tau`: the relative τ used, as given or found; None for methods without.
-    - `consistency`, `confidence`: of a learned method, which may make things up: residual of the
-      explained capture, root mean square, over the noise's deviation, for each element of the
-      batch; and how sure it is of each pixel, 0 to 1, (*batch, y, x).
+    - `consistency`, `confidence`: measures of trust in a learned method, which may make things up:
+      residual of the explained capture, root mean square, over the noise's deviation, for each
+      element of the batch; and how sure it is of each pixel, 0 to 1, (*batch, y, x).
     """
 
     image: Float[Array, "*batch y x"]

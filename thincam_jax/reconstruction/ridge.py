@@ -98,7 +98,7 @@ class Ridge(AbstractSolver):
       "sure" (Stein's unbiased estimate of the risk, with the noise variance of the recording)
       choose it from the captures of a separable camera of one term, for the least error of the
       image; "likelihood" (of the captures under the prior) as the image varies, for error bars.
-    - `synthesis`: as of `AdmmTV`.
+    - `synthesis`: weights of the captures, see `AdmmTV`.
     - `iterations`: at most. `tolerance`: estimated distance of the minimiser over that between it
       and the uniform image. `reason` and `history[-1].primal` say what was not reached.
 
@@ -267,7 +267,7 @@ def solve_ridge(
     - `precision`: ρ > 0, 1/variance of the image, where the weights are 1/variance of the noise.
     - `mean`: f̄, uniform if (*batch, channel, 1, 1, 1); default the uniform image that explains
       the captures.
-    - `iterations`, `tolerance`: of conjugate gradients, see `Ridge`.
+    - `iterations`, `tolerance`: limits of conjugate gradients, see `Ridge`.
     """
     began = time.perf_counter()
     dtype = problem.captures[0].dtype
@@ -306,7 +306,7 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
 
 
 def _by_modes(about: InverseProblem, curvature, normal: SeparableNormal, mean):
-    """The same in closed form, scaled after the captures' modes are taken: no scaled copies."""
+    """Ridge solution in closed form, scaled after the captures' modes are taken: no copies."""
     (capture,), weight = about.captures, about.weights[0].reshape(())
     modes, operator_unit = normal.modes, jnp.sqrt(curvature / or_one(weight))
     seen = modes.seen(capture)

@@ -59,7 +59,7 @@ class ScaledProblem(eqx.Module):
     of captures, pixels and weights.
 
     - `image_unit`: times this, an image of `problem` is one of the problem given; `capture_unit`:
-      the same for captures.
+      factor for captures.
     - `curvature`: Lipschitz constant of the problem given, with a margin.
 
     Fewer `iterations` of the power method are faster, and ‖√w A‖ may then be somewhat above 1.

@@ -37,7 +37,7 @@ class Stream(AnyRank):
 
     **Arguments**
 
-    - `recording`: of the first capture.
+    - `recording`: recording of the first capture.
     - `solver`: with τ a number; its iterations are those of the first capture.
     - `steps`: m, iterations for each later capture.
 

@@ -101,7 +101,7 @@ def phase_contrasts(cameras: Sequence[LenslessCamera], wavelength: Any) -> np.nd
 
 
 def keep_bias(synthesis: np.ndarray) -> np.ndarray:
-    """Which channels keep the captures' common background: those whose weights do not cancel."""
+    """Mask of the channels that keep the captures' common background: weights do not cancel."""
     return np.abs(synthesis.sum(axis=1)) > 1e-6
 
 

@@ -37,9 +37,9 @@ class TotalVariation(AbstractRegulariser):
 
     - `kind`: "isotropic" takes the length of the vector of differences, "anisotropic" the sum of
       their absolute values, which favours edges along the axes.
-    - `coupling`: of colours. "none": channels independent. "joint": one length over all channels
-      (vectorial total variation), so that edges lie in the same place. "opponent" (three channels):
-      the sum of the variations of grey and of the two colour differences. Noise of three
+    - `coupling`: coupling of colours. "none": channels independent. "joint": one length over all
+      channels (vectorial total variation), so that edges lie in the same place. "opponent" (three
+      channels): the sum of the variations of grey and of the two colour differences. Noise of three
       channels is averaged in grey, and colours vary less than grey in most scenes.
     - `depth_weight`: δ, the weight of a difference between planes; 0 leaves planes independent.
     - `chroma_weight`: weight of the two colour differences with "opponent".
@@ -200,7 +200,7 @@ def _shortened(slopes, step, channels: bool):
 
 @functools.partial(_shortened.defjvp, symbolic_zeros=True)
 def _shortened_slope(channels: bool, primals, tangents):
-    r"""With the part k that is kept and the direction n, k ds + (1 − k) n (n·ds) − n dstep.
+    r"""Slope k ds + (1 − k) n (n·ds) − n dstep, of the part k that is kept and the direction n.
 
     Written out so that a gradient holds k and n alone: the compiler's own holds four times as much.
     """

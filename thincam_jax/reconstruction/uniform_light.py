@@ -63,7 +63,7 @@ def window_length(problem: InverseProblem) -> int:
 def high_passed(problem: InverseProblem, kept: Sequence[float]) -> InverseProblem | None:
     """Convolutions and captures filtered with δ − (1 − kept) w, see `without_uniform_light`.
 
-    - `kept`: of each capture's zero frequency; 1 leaves a capture as it is.
+    - `kept`: part kept of each capture's zero frequency; 1 leaves a capture as it is.
 
     None if all are, or few pixels remain.
     """

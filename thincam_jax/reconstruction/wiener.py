@@ -142,7 +142,8 @@ class WienerSynthesis(eqx.Module):
     ) -> Reconstruction:
         """The reconstruction of captures (capture, *batch, y, x).
 
-        `noise_variance`: of a pixel, one number, one for each capture or (capture, *batch); > 0.
+        `noise_variance`: that of a pixel, > 0, one number, one for each capture or (capture,
+        *batch).
         """
         captures = jnp.asarray(captures, dtype=self.uniform.dtype)
         require_captures(captures, (len(self.uniform), *self.sensor_shape))
@@ -204,7 +205,8 @@ class Wiener(AbstractSolver):
     background cancels. The noise is estimated if the recording has no variance. To reconstruct many
     scenes with the same cameras call `prepare(cameras)` once, and its result on each.
 
-    - `synthesis`, `prior`: as of `WienerSynthesis`.
+    - `synthesis`, `prior`: weights of the captures and spectrum of the scene, see
+      `WienerSynthesis`.
 
     ```python
     import thincam_jax as tc

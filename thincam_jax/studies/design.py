@@ -67,8 +67,9 @@ class TrainingPlan:
     """Photographs that designs are trained on, and how.
 
     - `images`: by name, (y, x) or (y, x, channel); their middle squares are taken.
-    - `pixels`: of the sensor's shorter side; None: as many as the finest fringes need.
-    - `denoiser`: of the reconstruction "pnp", such as `learn.Denoiser()`.
+    - `pixels`: number of pixels of the sensor's shorter side; None: as many as the finest fringes
+      need.
+    - `denoiser`: denoiser of the reconstruction "pnp", such as `learn.Denoiser()`.
     """
 
     images: Mapping[str, np.ndarray]
@@ -110,13 +111,14 @@ class FrontPlan:
 class DesignStudy:
     """A search for the best design, and its simulation beside the designs to beat.
 
-    - `study`: of the simulation: zone plate, sensor, noise, targets and seed; its methods are the
-      designs given, see `of_designs`.
-    - `problem`: of the search, its base the design to beat; in double precision, see
+    - `study`: study of the simulation: zone plate, sensor, noise, targets and seed; its methods are
+      the designs given, see `of_designs`.
+    - `problem`: problem of the search, its base the design to beat; in double precision, see
       `design_problem`.
     - `rivals`: the other designs given, by name.
-    - `settings`: of the search; `grid`: points along each side of the landscape.
-    - `seeds`: of the noise in the simulation; `best`: how many of the designs found it has.
+    - `settings`: length of the search; `grid`: points along each side of the landscape.
+    - `seeds`: number of seeds of the noise in the simulation; `best`: how many of the designs found
+      it has.
     - `photographs`: how many further ones the best design is compared on with the one to beat,
       none of them trained on; 0 for none.
     - `training`, `fronts`: None for none.
@@ -147,7 +149,7 @@ class DesignStudy:
 
     @property
     def key(self) -> PRNGKeyArray:
-        """Of the search, from the seed of the study."""
+        """Random key of the search, from the seed of the study."""
         return jax.random.key(self.study.seed)
 
     @property
@@ -213,8 +215,8 @@ def as_method(
 class FoundDesigns:
     """Result of a search.
 
-    - `edge`: of the frequencies looked at, cycles/rad; `exponent`: of the prior.
-    - `transfers`: of the reference and of the best design.
+    - `edge`: highest of the frequencies looked at, cycles/rad; `exponent`: exponent of the prior.
+    - `transfers`: modulation transfer of the reference and of the best design.
     - `training`: the trained designs; None without training.
     - `random`: the best of `random_designs` random ones, at the cost of the search.
     - `held_out`: the best design and the random one on photographs not trained on.
@@ -306,7 +308,7 @@ class DesignSearch:
                 self.found = rank_trained(self.problem, self.trained)
 
     def _compare(self) -> None:
-        """With the best of random designs at the same cost."""
+        """Compare with the best of random designs at the same cost."""
         key = jax.random.fold_in(self.study.key, 1)
         with allow("float64"):
             design, self.sampled = random_search(

@@ -249,7 +249,7 @@ def _mean(levels: Iterable[float | None]) -> float | None:
 
 
 def _dominated(points: Iterable[FrontPoint], worth: Iterable[float | None]) -> list[bool]:
-    """By their cost, and what they are worth."""
+    """Whether each point is dominated, by cost and by worth."""
     pairs = zip((point.cost for point in points), worth, strict=True)
     known = [(cost, math.nan if own is None else own) for cost, own in pairs]
     return (~non_dominated(np.asarray(known, float), larger=(False, True))).tolist()

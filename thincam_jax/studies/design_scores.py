@@ -91,8 +91,8 @@ def reported_names(designs: Iterable[WithShots]) -> tuple[str, ...]:
 class ObjectiveScores:
     """Objective of a search.
 
-    - `label`: quantity and unit of the reported values. `unit`: of gains.
-    - `prior_exponent`: of the scene's spectrum.
+    - `label`: quantity and unit of the reported values. `unit`: unit of gains.
+    - `prior_exponent`: exponent of the scene's spectrum.
     """
 
     name: str
@@ -143,7 +143,7 @@ class FreeNumber:
     unit: str
 
     def __str__(self) -> str:
-        """With its tolerance."""
+        """The value with its tolerance."""
         return str(FreeValue(self.variable, (), self.value, self.tolerance))
 
 
@@ -154,7 +154,7 @@ class Candidate(WithShots):
     Of one that is only simulated, shots alone.
 
     - `training_error`: None without training.
-    - `predicted_gain` and all below: of a design found; gains over the one to beat.
+    - `predicted_gain` and all below: numbers of a design found; gains over the one to beat.
     """
 
     name: str
@@ -208,11 +208,11 @@ class Validation:
 class PointScores(WithShots):
     """A point of a front.
 
-    - `resolution_ends`: what ends it other than the signal, in words.
-    - `bayes_error`: of the best linear reconstruction, as a part of the scene's variance.
-    - `dominated`: by another point; by the simulated mean, `simulated_dominated`. None: of the
-      design to beat.
-    - `predicted_psnr_db` and what is simulated: of captures.
+    - `resolution_ends`: cause other than the signal that ends it, in words.
+    - `bayes_error`: error of the best linear reconstruction, as a part of the scene's variance.
+    - `dominated`: whether another point dominates it; by the simulated mean, `simulated_dominated`.
+      None for the design to beat.
+    - `predicted_psnr_db` and what is simulated: figures of the front of captures.
     """
 
     cost: float
@@ -231,8 +231,9 @@ class PointScores(WithShots):
 class FrontScores:
     """A front: its points in the order of their cost, and the design to beat.
 
-    - `label`: of the cost, with its unit.
-    - `exposure`: how captures share it, in words; `picture_variance`: of captures.
+    - `label`: label of the cost, with its unit.
+    - `exposure`: how captures share it, in words; `picture_variance`: variance of pictures, for the
+      front of captures.
     """
 
     label: str
@@ -242,7 +243,7 @@ class FrontScores:
     picture_variance: float | None = None
 
     def table(self, name: str, reference: str) -> Table:
-        """Its points and the design to beat; `name`: of the front in `FrontsScores`."""
+        """Table of the points and the design to beat; `name`: the front's in `FrontsScores`."""
         names = reported_names([*self.points, self.reference])
         labels = [REPORTED[name].label for name in names]
         points = [(_cost(point.cost), point) for point in self.points]
@@ -281,7 +282,7 @@ class FrontsScores:
 
     @property
     def fronts(self) -> dict[str, FrontScores]:
-        """By name."""
+        """Fronts by name."""
         given = {name: getattr(self, name) for name in COSTS}
         return {name: front for name, front in given.items() if front is not None}
 
@@ -444,7 +445,7 @@ def _spread(spread: Spread | None, digits: int, sign: str = "+") -> str:
 
 
 def signed(value: float | None, digits: int) -> str:
-    """With its sign and so many decimals; a dash for none."""
+    """Text of a value with its sign and so many decimals; a dash for none."""
     return "–" if value is None else f"{value:+.{digits}f}"
 
 

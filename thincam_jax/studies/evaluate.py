@@ -55,7 +55,7 @@ class Resolved:
 class Scores:
     """Figures of merit of a reconstruction; None for the PSNR of an exact one.
 
-    - `object_pixel_mm`: its pixels on the object. `resolved`: of a chart.
+    - `object_pixel_mm`: its pixels on the object. `resolved`: finest element resolved of a chart.
     """
 
     psnr_db: float | None
@@ -153,7 +153,7 @@ def reconstructor(
 def cameras_of(
     study: Study, method: Method, shape: tuple[int, int], object_distance: float
 ) -> Cameras:
-    """Those of a method's exposures."""
+    """Cameras of a method's exposures."""
     return Cameras(
         [study.camera(exposure) for exposure in method.exposures],
         wavelength=[exposure.wavelength for exposure in method.exposures],
@@ -167,7 +167,7 @@ def cameras_of(
 def _solver(
     study: Study, method: Method, shape: tuple[int, int], object_distance: float
 ) -> Reconstructor:
-    """With the PSF of the axis everywhere."""
+    """Reconstruction of captures, with the PSF of the axis everywhere."""
     cameras = cameras_of(study, method, shape, object_distance)
     if isinstance(method.solver, FringeScanning):
         scanning = method.solver.prepare(cameras)
@@ -182,7 +182,7 @@ def _solver(
         return wiener
 
     def solved(captures: Array, variances: Array) -> Reconstruction:
-        """On the crop model; without noise in the study it is estimated."""
+        """Reconstruction on the crop model; without noise in the study it is estimated."""
         noise_variance = None if study.noise is None else variances
         recording = Recording(captures, cameras, noise_variance=noise_variance, background=0.0)
         return reconstruct(recording, coupled(solver, captures.shape[1]))
@@ -246,7 +246,7 @@ def sample(plane: ImagePlane, grid: Grid) -> Array:
 
 
 def as_picture(image: np.ndarray) -> np.ndarray:
-    """From (channel, y, x) to (y, x) or (y, x, channel)."""
+    """Picture (y, x) or (y, x, channel) of an image (channel, y, x)."""
     picture = np.moveaxis(image, 0, -1)
     return picture[..., 0] if picture.shape[-1] == 1 else picture
 

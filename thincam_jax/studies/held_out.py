@@ -31,7 +31,7 @@ class GainOverPhotographs:
 
     @classmethod
     def of(cls, values: Iterable[float]) -> "GainOverPhotographs":
-        """Of two values or more."""
+        """Gain from the values on two photographs or more."""
         gains = np.array([*values])
         half = scipy.stats.t.ppf(0.975, len(gains) - 1) * np.std(gains, ddof=1) / len(gains) ** 0.5
         ends = (float(np.mean(gains) + side * half) for side in (0, -1, 1))

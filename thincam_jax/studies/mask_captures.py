@@ -34,8 +34,9 @@ class ComparedMask:
     """One mask, or the several that a camera takes one after the other.
 
     - `masks`: one for each capture; the captures share the light.
-    - `synthesis`: what is made of the captures; "fringe_scanning" takes the phases 0, π/2, π, 3π/2.
-    - `sort`: of which sort it is; plots draw each by a dash and a grey of its own.
+    - `synthesis`: sums that are made of the captures; "fringe_scanning" takes the phases 0, π/2, π,
+      3π/2.
+    - `sort`: sort of mask; plots draw each by a dash and a grey of its own.
 
     **Errors**: ValueError for a number of masks that the synthesis does not take.
     """
@@ -64,7 +65,7 @@ class Setting:
 
     - `sensor`: shape and pitch; how long it is exposed follows from the light.
     - `distance`: mask to sensor, mm; `field`: pixels (rows, columns) that the scene covers there.
-    - `width`: of the masks, mm; pinholes are smaller.
+    - `width`: width of the masks, mm; pinholes are smaller.
     - `read_noise`: electrons.
     """
 
@@ -76,14 +77,14 @@ class Setting:
 
     @property
     def pitch(self) -> float:
-        """Of the sensor, mm."""
+        """Pixel pitch of the sensor, mm."""
         return float(self.sensor.pitch)
 
 
 class Seen(eqx.Module):
     """Statistics of scenes from their captures.
 
-    - `channels`: sums of captures; `variance`: of their noise, for each scene.
+    - `channels`: sums of captures; `variance`: variance of their noise, for each scene.
     - `level`: brightness of the uniform scene that explains the captures best, which sums that
       cancel the uniform light do not tell.
     """
@@ -262,7 +263,7 @@ def strength(
     wavelength: float,
     object_distance: float,
 ) -> Strength:
-    """Of captures that share the light, the sums that are made of them count."""
+    """Strength of a mask; of captures that share the light, the sums made of them count."""
     pitch = setting.pitch
     open_light = (setting.width * (1 + setting.distance / object_distance)) ** 2
     light = float(jnp.mean(jnp.sum(psfs, axis=(-2, -1)))) * pitch**2

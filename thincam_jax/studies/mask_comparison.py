@@ -1,4 +1,4 @@
-"""Which mask for which scene: masks of every family before one sensor, in equal light."""
+"""Comparison of masks of every family before one sensor, scene by scene, in equal light."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ Estimate = Literal["total variation", "linear", "focused far"]
 class ComparedScene:
     """A scene on the field's pixels (y, x), 0 to 1, as it is cast on the sensor.
 
-    - `prior`: what the linear estimate takes for its spectrum.
+    - `prior`: spectrum that the linear estimate assumes for it.
     """
 
     image: Float[np.ndarray, "y x"]
@@ -82,7 +82,7 @@ class Tuning:
 
 @dataclass(frozen=True)
 class Case:
-    """Of which image a score is; `electrons` a pixel of the bare sensor, `distance` in mm."""
+    """Key of a score: the image; `electrons` a pixel of the bare sensor, `distance` in mm."""
 
     mask: str
     scene: str
@@ -164,7 +164,7 @@ class MaskComparison:
         return result
 
     def _key(self, *numbers: int) -> PRNGKeyArray:
-        """The same noise for every mask: a better image is a better mask."""
+        """Random key of the noise, equal for all masks: a better image is a better mask."""
         key = jax.random.key(self.seed)
         for given in numbers:
             key = jax.random.fold_in(key, given)

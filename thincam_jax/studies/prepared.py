@@ -40,8 +40,8 @@ _WINDOWS = 28
 class PixelNoise:
     """Noise of a prepared pixel.
 
-    - `deviation`: standard deviation in the unit of the prepared capture; `counts`: the same in
-      counts of a raw pixel.
+    - `deviation`: standard deviation in the unit of the prepared capture; `counts`: that in counts
+      of a raw pixel.
     - `found`: how it is known, in words.
     """
 
@@ -76,7 +76,7 @@ def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
 def computed_psf(cameras: Cameras, name: str) -> Raw:
     """PSF of a camera as a measured one, also beyond the sensor where the shadow is larger.
 
-    `name`: what stands before the numbers of the camera and its light.
+    `name`: words before the numbers of the camera and its light.
     """
     (camera,), wavelength, distance = cameras.cameras, cameras.wavelength, cameras.object_distance
     how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
@@ -128,7 +128,7 @@ class PreparedFacts:
 
 
 def check_channels(prepared: Prepared, name: str) -> None:
-    """Refuse a channel in which nothing can be seen; `name`: of the capture, for messages.
+    """Refuse a channel in which nothing can be seen; `name`: name of the capture in messages.
 
     **Errors**: MeasurementError, one line.
     """
@@ -201,8 +201,8 @@ def reconstruct_prepared(
 ) -> PreparedResult:
     """Reconstruct all that sends light to the sensor, every channel of a prepared capture.
 
-    - `noise`: see `pixel_noise`. `callback`: as of `tc.reconstruct`.
-    - `name`: of the capture, for messages.
+    - `noise`: see `pixel_noise`. `callback`: see `tc.reconstruct`.
+    - `name`: name of the capture, for messages.
 
     ```python
     import numpy as np

@@ -104,7 +104,7 @@ def relative_error(image: Num[ArrayLike, "..."], reference: Num[ArrayLike, "..."
 def contrast_error(
     image: Num[ArrayLike, "*batch y x"], reference: Num[ArrayLike, "*batch y x"]
 ) -> float:
-    """The same without the mean of each (y, x) image: the bias of a capture carries no picture."""
+    """Relative error without each (y, x) image's mean: a capture's bias carries no picture."""
     contrasts = (np.asarray(a, float) for a in (image, reference))
     return relative_error(*(c - c.mean(axis=(-2, -1), keepdims=True) for c in contrasts))
 
@@ -187,7 +187,7 @@ class PsfErrors:
 
     @property
     def rows(self) -> list[PsfAccuracy]:
-        """Of every candidate that is done."""
+        """Rows of all candidates that are done."""
         measured = [row for row in self._rows if row.true_error]
         worth = pareto_front([(row.seconds or 0.0, row.true_error or 0.0) for row in measured])
         front = {id(row) for row, on_it in zip(measured, worth, strict=True) if on_it}
@@ -235,7 +235,7 @@ class PsfErrors:
 
 
 def pareto_front(points: list[tuple[float, float]]) -> list[bool]:
-    """Of points (seconds, error), which have no other that is as fast and as accurate.
+    """Mask of the points (seconds, error) that no other matches in speed and accuracy.
 
     Errors within 5 % of each other count as equal, so that the last digits of a model's error do
     not make its slower precision worth choosing. Of points that are equal in both the first is.

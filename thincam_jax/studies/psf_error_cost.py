@@ -58,7 +58,7 @@ class Case:
 
     - `study`: the binned study, with the exact model.
     - `method`: the method that reconstructs; its first exposure is the one captured.
-    - `target`: what is seen.
+    - `target`: target that is seen.
     - `skipped`: why nothing is reconstructed; None where something is.
     """
 
@@ -91,10 +91,10 @@ def make_case(study: Study, size: int) -> Case:
 class CaptureError:
     """Errors of a capture by a model, relative to separable in float64; None where it is not run.
 
-    - `psf_error`: of the PSF over the sensor.
+    - `psf_error`: error of the PSF over the sensor.
     - `kernel_error`: over all that the capture takes of the PSF, which reaches beyond the sensor by
       the projected target.
-    - `error`, `contrast_error`: of the capture, with its mean and without.
+    - `error`, `contrast_error`: errors of the capture, with its mean and without.
     """
 
     model: Model
@@ -386,7 +386,8 @@ class AccuracyResult:
 class AccuracyRun:
     """The models of a study's first exposure, step by step: `work` fills what `result` holds.
 
-    - `sizes`: pixels along the sensor's longer side, for the PSFs. `case`: what is captured.
+    - `sizes`: pixels along the sensor's longer side, for the PSFs. `case`: target and camera of the
+      captures.
     """
 
     def __init__(self, study: Study, sizes: Sequence[int], case: Case):

@@ -55,7 +55,7 @@ _MARGIN = 1.15  # the field over what the objects cover
 class SceneObject:
     """A picture (y, x) or (y, x, channel) that stands at a distance, on a dark ground.
 
-    - `distance`, `width`: mm; `x`, `y`: of its middle, mm.
+    - `distance`, `width`: mm; `x`, `y`: place of its middle, mm.
 
     Colours are averaged.
     """
@@ -80,7 +80,7 @@ class PlacedTarget(Target):
 
     @property
     def height(self) -> float:
-        """Of the object itself, mm: the plane reaches as far to the other side of the axis."""
+        """Height of the object, mm: its plane reaches as far to the other side of the axis."""
         return float(self.plane.height) - 2 * abs(self.y)
 
 
@@ -89,8 +89,9 @@ class FocusRange:
     """The distances of a sweep of the focus, and what is called sharp.
 
     - `method`: by name, that the sweep reconstructs with.
-    - `nearest`, `farthest`: mm; `count`: of the distances, evenly spaced in 1/t.
-    - `measure`, `smoothing`: of sharpness, see `focus_measure`; `window`: of the depth map.
+    - `nearest`, `farthest`: mm; `count`: number of distances, evenly spaced in 1/t.
+    - `measure`, `smoothing`: measure of sharpness, see `focus_measure`; `window`: window of the
+      depth map.
     """
 
     method: str
@@ -108,7 +109,7 @@ class FocusRange:
 
     @property
     def distances(self) -> list[float]:
-        """Of the sweep, mm."""
+        """Distances of the sweep, mm."""
         return np.asarray(refocus_distances(self.nearest, self.farthest, self.count)).tolist()
 
 
@@ -236,7 +237,7 @@ def place(study: Study, number: int, given: SceneObject) -> PlacedTarget:
 
 
 def _pixels_per_mm(study: Study, method: Method, placed: SceneObject | Target) -> float:
-    """Of a reconstruction, on an object."""
+    """Pixels of a reconstruction for each mm on an object."""
     return method.distance / placed.distance / study.pitch
 
 

@@ -38,7 +38,7 @@ class MethodScores:
 
     @property
     def resolved_mm(self) -> float | None:
-        """Its line pair on the object, mm."""
+        """Line pair that is resolved on the object, mm."""
         return None if self.resolved is None else self.resolved.object_mm
 
 

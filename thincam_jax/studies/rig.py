@@ -44,7 +44,7 @@ COLOURS = "red", "green", "blue"
 class CountingCamera:
     """Response of a camera to light, for the noise of its frames.
 
-    - `counts`: of a unit of the noise-free image; `electron`: counts of an electron.
+    - `counts`: counts of a unit of the noise-free image; `electron`: counts of an electron.
     - `read_noise`: in electrons; `offset`: counts that were not subtracted.
     """
 
@@ -54,7 +54,7 @@ class CountingCamera:
     offset: float = 0.0
 
     def variance(self, counts: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Of a frame whose noise-free counts, without the offset, are given."""
+        """Noise variance of a frame, counts², from its noise-free counts without the offset."""
         return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
 
 
@@ -113,8 +113,8 @@ def compare_frames(
 ) -> FrameComparison:
     """Compare frames and their image with a direct simulation of the same exposures.
 
-    - `study`: of the whole sensor, whose first target the rig looked at.
-    - `solve`: see `frame_solver`; `captured`: what it makes of the rig's frames.
+    - `study`: study of the whole sensor, whose first target the rig looked at.
+    - `solve`: see `frame_solver`; `captured`: image that it makes of the rig's frames.
     """
     camera, target = rig.camera, study.targets[0]
     assert camera is not None
@@ -222,8 +222,8 @@ def recover_to(
 ) -> MeasuredMatrix:
     """Recover the matrix of captures into a folder, block by block: matrix.zarr, reduced.npz.
 
-    - `exact`: of a virtual rig, its system (see `monitor_system`), its camera, and the part of the
-      sensor that was read; the matrix is compared with it.
+    - `exact`: truth of a virtual rig: its system (see `monitor_system`), its camera, and the part
+      of the sensor that was read; the matrix is compared with it.
     """
     path, shape = folder / "matrix.zarr", captures.series.object_shape
     shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
@@ -298,8 +298,8 @@ def reconstruct_pictures(
     """Pictures from frames, equally many of each in the order of `targets`, by a calibration.
 
     - `known`: see `calibrated`.
-    - `variance`: of each pixel, infinite where it is not known: its mean counts, and without such
-      pixels the matrix is reduced anew. Else the noise is estimated from the frames.
+    - `variance`: variance of each pixel, infinite where it is not known: its mean counts, and
+      without such pixels the matrix is reduced anew. Else the noise is estimated from the frames.
 
     **Errors**: ValueError where the matrix is of other cells or pixels than the frames.
     """
@@ -323,7 +323,7 @@ def reconstruct_pictures(
 
 
 def lensless_system(study: Study, width: float) -> CropConvolution | LowRank:
-    """From a monitor that covers so many mm to the sensor, by a study's first camera."""
+    """Operator from a monitor `width` mm wide to the sensor, by a study's first camera."""
     shape = same_parity(square_field(study, width), study.sensor.shape)
     exposure = study.methods[0].exposures[0]
     light, method = exposure.wavelength, PsfMethod(study.model, pixel_integration=True)
@@ -341,7 +341,7 @@ def align_display(
     """Find a display before a study's first camera, by frames of a mark each.
 
     - `study`: its `config` has the object's width, within which marks are looked for.
-    - `shown`: levels of the display for each frame. `pitch`: of its pixels, mm.
+    - `shown`: levels of the display for each frame. `pitch`: pitch of its pixels, mm.
 
     **Errors**: MeasurementError where too few marks agree; see `fit_alignment`.
     """

@@ -28,9 +28,9 @@ def frame_solver(
 ) -> FrameSolver:
     """The function that reconstructs frames (capture, y, x) by the method of a study.
 
-    - `width`: of the square object that the image covers, mm.
-    - `variance`: of each pixel of a frame, infinite where it is not known; AdmmTV takes the mean
-      and leaves those out, of a single frame. Else the noise is estimated from the frames.
+    - `width`: width of the square object that the image covers, mm.
+    - `variance`: variance of each pixel of a frame, infinite where it is not known; AdmmTV takes
+      the mean and leaves those out, of a single frame. Else the noise is estimated from the frames.
     - `bayer`: pattern of the frames. They are demosaiced by linear interpolation, and the study has
       a method each for red, green and blue.
     """
@@ -55,7 +55,7 @@ def _channels(
     variance: Float[np.ndarray, "y x"] | None,
     bayer: Pattern | None,
 ) -> Iterator[tuple[Array, Array, np.ndarray | None]]:
-    """Of each colour: captures (capture, 1, y, x), variance of a pixel, and pixels to trust."""
+    """Captures (capture, 1, y, x) of each colour, variance of a pixel and pixels to trust."""
     shape, colours, valid = frames.shape[1:], frames[..., None], None
     sites, step = [np.ones(shape, bool)], 1
     if bayer is not None:
@@ -78,11 +78,11 @@ def _channels(
 def _solver_of(
     study: Study, method: Method, width: float, share: float
 ) -> Callable[..., Reconstruction]:
-    """Of captures, the variance of a pixel's noise, and the pixels to trust.
+    """Function of captures, the variance of a pixel's noise and the pixels to trust: an image.
 
-    - `share`: of the pixels that see the method's colour. Interpolated, their noise has a spectrum
-      that falls from variance/share, which the filter takes; total variation is better off with
-      the variance itself.
+    - `share`: share of the pixels that see the method's colour. Interpolated, their noise has a
+      spectrum that falls from variance/share, which the filter takes; total variation is better off
+      with the variance itself.
     """
     cameras = cameras_of(study, method, square_field(study, width), study.object_distance)
     solver: Any = coupled(method.solver, 1)
@@ -111,7 +111,7 @@ def live_image(
     """The function that makes an image, levels 0 to 1, of one frame of a study's first exposure.
 
     By a Wiener filter, fast enough for a picture of what a camera sees now: without fringe scanning
-    a zone plate's background and twin image stay. `bayer`: as of `frame_solver`.
+    a zone plate's background and twin image stay. `bayer`: see `frame_solver`.
     """
     methods = []
     for number, method in enumerate(study.methods):

@@ -90,14 +90,15 @@ class ScreenStudy:
     - `plane`: cells that show the targets.
     - `targets`: by name, radiance 0 to 1 on the cells, (y, x), or (y, x, channel) with a
       full-colour hologram.
-    - `noise`: of the captures; each target has noise of its own key.
+    - `noise`: noise of the captures; each target has noise of its own key.
     - `solvers`: by name.
     - `models`: the first one takes the captures.
-    - `orders`: of ghosts; `band_samples`: as of `waveguide.system_operator`.
-    - `recording_angles`: of the object and the reference wave in the film, rad, which the mistake
-      "grating" needs.
+    - `orders`: number of ghosts; `band_samples`: see `waveguide.system_operator`.
+    - `recording_angles`: angles of the object and the reference wave in the film, rad, which the
+      mistake "grating" needs.
     - `mask`: in the place of the lens, before a bare sensor; None for the lens.
-    - `responses`: of a sensor with cross-talk, see `colour_system`; empty: it separates colours.
+    - `responses`: responses of a sensor with cross-talk, see `colour_system`; empty: it separates
+      colours.
     - `config`: the sections of the file that it was read from, if any.
 
     ```python
@@ -156,7 +157,7 @@ class ScreenStudy:
 
     @property
     def wavelengths(self) -> np.ndarray:
-        """Of each pixel's image, mm, (y, x), or (channel, y, x) of several cameras."""
+        """Wavelength of each pixel's image, mm, (y, x), or (channel, y, x) of several cameras."""
         found = np.stack([np.asarray(self.rays(camera).wavelength) for camera in self.cameras])
         return found if len(self.cameras) > 1 else found[0]
 
@@ -406,7 +407,7 @@ class RaySummary:
     status_percent: dict[str, float]
 
     def __str__(self) -> str:
-        """In two sentences; empty where no ray reaches the object."""
+        """Summary in two sentences; empty where no ray reaches the object."""
         if self.wavelength_nm is None or self.guided_angle_deg is None:
             return ""
         colours, angles, ghost = self.wavelength_nm, self.guided_angle_deg, ""

@@ -49,14 +49,15 @@ _SHOWN = 3  # cells whose columns of the matrix are compared with the exact ones
 class Calibration:
     """Measurement of a matrix, and the rays that are fitted to it.
 
-    - `order`, `display`, `dark_frames`: see `HadamardSeries`. `bits`: of the camera.
+    - `order`, `display`, `dark_frames`: see `HadamardSeries`. `bits`: bits of the camera.
     - `exposure`: part of the camera's range that a white monitor fills; `offset`: its dark level
       and `noise`: standard deviation of its white noise, in counts.
     - `keep_captures`: leave the stores of captures in the folder that is given.
     - `glass_thickness`: assumed before the fit, mm; None for the true one.
     - `fitted`: the parameters that are found, keys of `measured.calibration.screen_fit.PARAMETERS`.
       A plate whose tilt is fitted is taken for straight before.
-    - `distances`: of the object, mm, at which the matrix follows from the fit and is measured anew.
+    - `distances`: distances of the object, mm, at which the matrix follows from the fit and is
+      measured anew.
     """
 
     order: Annotated[Order, choice(get_args(Order))] = "sequency"
@@ -90,7 +91,7 @@ class Calibration:
 class SystemMatrix(eqx.Module):
     """A measured or modelled matrix, reduced so that one compiled program serves all.
 
-    - `counts`: of the camera in the unit of the matrix, where a model has 1.
+    - `counts`: counts of the camera in the unit of the matrix, where a model has 1.
     """
 
     matrix: Matrix | Sparse
@@ -119,7 +120,7 @@ def measure_matrix(
     """The matrix of a camera from simulated captures of Hadamard patterns.
 
     - `system`: the camera's own matrix.
-    - `folder`: of the store of captures; default a temporary one.
+    - `folder`: folder of the store of captures; default a temporary one.
     """
     plane, full = study.plane, math.prod(system.out_shape)
     brightest = float(jnp.max(system(jnp.ones(system.in_shape, dtype_of(system)))))
@@ -212,9 +213,9 @@ class DistanceScores:
 class CalibrationScores:
     """Figures of merit of a calibration.
 
-    - `frames`, `seconds`: of the measurement.
-    - `largest_counts`, `noise_counts`: of the matrix' entries; `expected_noise_counts`: by the
-      noise of the frames.
+    - `frames`, `seconds`: frames and duration (s) of the measurement.
+    - `largest_counts`, `noise_counts`: largest and noise of the matrix' entries, counts;
+      `expected_noise_counts`: their noise by that of the frames.
     - `distances`: by distance and by how the matrix was found.
     """
 
@@ -241,9 +242,9 @@ class CalibrationScores:
 class CalibrationResult:
     """A calibrated screen.
 
-    - `methods`: what the measured matrix reconstructs, by name of the solver.
+    - `methods`: reconstructions by the measured matrix, by name of the solver.
     - `columns`: captures of the `cells` (row, column) alone, in counts, as "measured" and "exact".
-    - `images`: of the targets, by distance and by how the matrix was found.
+    - `images`: images of the targets, by distance and by how the matrix was found.
     """
 
     study: ScreenStudy
@@ -262,7 +263,7 @@ def calibrate(
 ) -> CalibrationResult:
     """Measure the matrix of a study's camera, reconstruct with it, and fit the screen to it.
 
-    - `folder`: of the stores of captures; default a temporary one.
+    - `folder`: folder of the stores of captures; default a temporary one.
 
     Of several colours each primary has its patterns, and every channel of a frame is read; neither
     a fit nor other distances follow.

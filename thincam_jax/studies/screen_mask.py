@@ -42,7 +42,8 @@ def _odd(name: str, value: Any) -> int:
 class MaskSystem(Matrix):
     """The matrix from an object's cells to the sensor, mm².
 
-    - `errors`: of its PSFs, the `truncation_error` and `interpolation_error` of `LowRankFit`.
+    - `errors`: errors of its PSFs, the `truncation_error` and `interpolation_error` of
+      `LowRankFit`.
     """
 
     errors: tuple[float, float] = eqx.field(static=True)
@@ -65,9 +66,10 @@ class ScreenMask:
     to the plate. Captures are irradiances relative to the open aperture, summed over it: mm².
 
     - `mask`: whose middle is on the axis.
-    - `model`: of its PSFs, averaged over pixels; see `psf`.
+    - `model`: model of its PSFs, averaged over pixels; see `psf`.
     - `points`: along each side of the field, an odd number, at which they are computed.
-    - `tolerance`: of the sum of convolutions, relative to the PSFs at these points.
+    - `tolerance`: error of the sum of convolutions that is allowed, relative to the PSFs at these
+      points.
     """
 
     mask: AbstractMask
@@ -148,10 +150,10 @@ def field_points(
 def first_image(
     camera: wg.SeeThroughCamera, plane: wg.ObjectPlane
 ) -> tuple[scipy.sparse.csr_array, tuple[int, int]]:
-    """From the cells of a plane to their image by order 0 through the middle of the mask.
+    """Matrix from the cells of a plane to their image by order 0 through the mask's middle.
 
-    A matrix to samples of the sensor's pitch about the axis, each the mean of what it covers of the
-    plane, and how many rows and columns of them there are.
+    The image has samples of the sensor's pitch about the axis, each the mean of what it covers of
+    the plane; also returned is how many rows and columns of them there are.
 
     **Errors**: ValueError where the screen does not show the whole plane.
     """

@@ -66,7 +66,7 @@ class Method:
     - `synthesis`: the sums of captures that are reconstructed, by the name of the function in
       `thincam_jax.reconstruction.synthesis`.
     - `phases`: exposures of each shot; 4 for fringe scanning, 2 for phase pairs.
-    - `harmonics`: of the synthesis of that name.
+    - `harmonics`: harmonics of the synthesis of that name.
 
     **Errors**: ValueError for exposures, phases or a solver that do not suit the synthesis, and for
     one exposure twice; FieldError where one field is to blame.
@@ -171,7 +171,7 @@ class Method:
 class Target:
     """A scene at one distance, in mm as its width.
 
-    - `number`: of its noise, its place in a study.
+    - `number`: number of its noise, its place in a study.
     - `kind`: "usaf1951", whose resolved element is found, "photograph" or "file", whose PSNR is
       averaged, or another word.
     - `plane`: the colour channels are a batch, (channel, y, x).
@@ -263,14 +263,14 @@ def check_methods(methods: Sequence[Method], sensor: Sensor, noise: AbstractNois
 class Study:
     """Cameras before targets, and the methods that reconstruct their captures.
 
-    - `mask`: what the masks of all exposures share, see `Exposures.cameras`.
-    - `object_distance`: of the point whose PSF and transfer functions are shown, mm.
+    - `mask`: properties that the masks of all exposures share, see `Exposures.cameras`.
+    - `object_distance`: distance of the point whose PSF and transfer functions are shown, mm.
     - `noise`: None leaves captures as they are.
-    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
-    - `field_tolerance`: of the captures, see `PsfMethod`. Reconstructions take the PSF of the axis,
-      and are divided by the light's fall.
-    - `seed`: of the noise: each capture of each target has a random key of its own.
-    - `mask_name`: of a mask without zones, in figures.
+    - `model`, `pixel_integration`: settings of the PSFs, see `thincam_jax.psf`.
+    - `field_tolerance`: tolerance of the captures, see `PsfMethod`. Reconstructions take the PSF of
+      the axis, and are divided by the light's fall.
+    - `seed`: seed of the noise: each capture of each target has a random key of its own.
+    - `mask_name`: name of a mask without zones, in figures.
     - `config`: the sections of the file that it was read from, if any.
     """
 
@@ -308,12 +308,12 @@ class Study:
 
     @functools.cached_property
     def exposures(self) -> tuple[Exposure, ...]:
-        """Of all methods, each once, in the order of first use."""
+        """Exposures of all methods, each once, in the order of first use."""
         return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
 
     @functools.cached_property
     def pitch(self) -> float:
-        """Of the pixels, mm."""
+        """Pitch of the pixels, mm."""
         return decimal_value(self.sensor.pitch)
 
     @property
@@ -363,7 +363,7 @@ class Study:
         return f"β {exposure.beta:.4g} rad/mm², φ {exposure.phase:.2f} rad"
 
     def psf(self, exposure: Exposure) -> Array:
-        """Of a point on the axis at the distance of the targets, (y, x)."""
+        """PSF of a point on the axis at the distance of the targets, (y, x)."""
         return psf(
             self.camera(exposure),
             wavelength=exposure.wavelength,

@@ -53,7 +53,7 @@ class Spread:
 class Comparison:
     """A method on a target over the seeds, and its gains over the first method, seed by seed.
 
-    - `gain_elements`: of the chart, of which six halve the line pair.
+    - `gain_elements`: gain in elements of the chart, of which six halve the line pair.
 
     None: images that are exact, a chart that is not resolved, and gains of the first method.
     """

@@ -46,7 +46,7 @@ class Screen(Module):
     """A plane-parallel glass plate with the same hologram at the top and at the bottom.
 
     - `hologram`: on the front surface before the camera and on the rear surface before the object.
-    - `glass_thickness`: w, mm. `glass_index`: of the plate.
+    - `glass_thickness`: w, mm. `glass_index`: index of the plate.
     - `top`, `bottom`: where the holograms are, mm from the camera's axis; None: everywhere.
     """
 
@@ -72,8 +72,8 @@ class SeeThroughCamera(Module):
 
     - `focal_distance`: d0, from the sensor to the lens, mm; the lens is a pinhole here.
     - `lens_distance`: d1, from the lens to the plate's rear surface, mm.
-    - `tilt`: of the plate against the camera, about x and then about y, rad; None for none. It
-      turns about where the camera's axis meets its rear surface; the object's plane stays.
+    - `tilt`: angles of the plate against the camera, about x and then about y, rad; None for none.
+      It turns about where the camera's axis meets its rear surface; the object's plane stays.
     """
 
     screen: Screen = eqx.field(converter=_screen)

@@ -49,7 +49,7 @@ Crosstalk = Literal["none", "bands", "all"]
 class ColourBand(Module):
     """A Gaussian, 1 at its centre: the response of a channel, or the spectrum of a primary.
 
-    - `centre`, `width`: of half the height, mm.
+    - `centre`, `width`: wavelength of the maximum and full width at half of it, mm.
     """
 
     centre: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.wavelength))
@@ -76,8 +76,8 @@ class ColourCamera(Module):
     - `cameras`: one for each grating, which differ in their hologram alone: in one film, each with
       its own index modulation, or in films one on the other. They count as independent: 12 nm
       apart, where bands overlap, integrals are up to 11 % off, 6 nm apart 11 to 13 %.
-    - `responses`: of the sensor's channels. `primaries`: spectra of the object's channels, as those
-      of a monitor; None for those of the sensor.
+    - `responses`: responses of the sensor's channels. `primaries`: spectra of the object's
+      channels, as those of a monitor; None for those of the sensor.
     """
 
     cameras: tuple[SeeThroughCamera, ...] = eqx.field(
@@ -100,7 +100,7 @@ class ColourCamera(Module):
 
     @property
     def crosstalk(self) -> tuple[Crosstalk, ...]:
-        """What `colour_system` can model: "none" with a grating for each channel alone."""
+        """Cross-talk that `colour_system` models: "none" with a grating for each channel alone."""
         return get_args(Crosstalk)[{len(self.cameras)} != set(self.channels) :]
 
     @property
@@ -116,7 +116,7 @@ class ColourCamera(Module):
         out: Int[Array, ""],
         counts: tuple[int, int],
     ) -> tuple[Float[Array, "grating ... 2"], Float[Array, "grating ..."]]:
-        """As `trace_band`, by each of the gratings that bring the light in.
+        """Trace the band of each pixel by each of the gratings that bring the light in.
 
         Points (grating, order, *pixel, sample, 2) are those of light without its colours, which
         have weights in each sample, (grating, channel, primary, order, *pixel, sample).
@@ -167,7 +167,7 @@ def _eta(hologram, tangential, wavelength) -> Float[Array, "2 *ray"]:
 
 
 def _one(camera, pixel, distance, out, counts):
-    """Of a pixel, points (in, order, sample, 2) and weights (in, colours, order, sample)."""
+    """Points (in, order, sample, 2) and weights (in, colours, order, sample) of one pixel."""
     orders, samples = counts
     film = jax.tree.map(lambda part: part[out], camera.gratings)
     own = eqx.tree_at(lambda c: c.screen.hologram, camera.cameras[0], film)
@@ -221,8 +221,8 @@ def colour_system(
     - `crosstalk`: "none": each channel has the light of its own grating and primary alone; "bands":
       whatever each grating diffracts into the glass and out of it; "all": what comes in by one
       grating and out by another, too.
-    - `levels`: what weight, mm, is 1 in each channel; by default the mean of its pixels, so that a
-      white object that fills the field gives captures about 1.
+    - `levels`: weight, mm, that counts as 1 in each channel; by default the mean of its pixels, so
+      that a white object that fills the field gives captures about 1.
     """
     checks.choice("crosstalk", crosstalk, camera.crosstalk)
     first, shape = camera.cameras[0], camera.channels

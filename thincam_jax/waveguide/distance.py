@@ -57,7 +57,7 @@ class GhostDistance:
 
     - `distance`: the likeliest, mm. `standard_error`: mm; infinite unless it is DETERMINED.
     - `distances`: all that were compared, mm, increasing.
-    - `log_likelihood`: of each, 0 at the likeliest.
+    - `log_likelihood`: log-likelihood of each distance, 0 at the likeliest.
     - `lead`: Student's t by which the likeliest is better than each, over parts of the capture.
     """
 

@@ -118,7 +118,7 @@ def weights_about(
 
 
 def least_nodes(orders: int) -> int:
-    """Of a band: up to 32 orders the same, so that fewer of them change nothing else."""
+    """Nodes of a band: equal up to 32 orders, so that fewer of them change nothing else."""
     return max(20 * (4 + orders), 720)
 
 
@@ -154,7 +154,7 @@ def band_about(
     centre: Float[Array, "*ray"],
     nodes: int,
 ) -> Band:
-    """From ξ = −10π to 10π about the Bragg wavelengths, in `nodes` even steps."""
+    """Band about the Bragg wavelengths, from ξ = −10π to 10π in `nodes` even steps."""
     slope = _band_slope(hologram, tangential, centre)
     wavelengths = centre[..., None] + _offsets(nodes, slope.dtype) / slope[..., None]
     eta = jnp.stack(unpolarised(hologram, tangential[..., None, :], wavelengths))

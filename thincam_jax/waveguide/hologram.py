@@ -49,9 +49,9 @@ class VolumeHologram(Module):
     """A reflection hologram of plane, equidistant fringes in a film.
 
     - `grating`: K, rad/mm, (x, y, z).
-    - `index`: of the film after processing, also that of the glass that it is on (no refraction
-      between the two).
-    - `thickness`: of the film after processing, mm.
+    - `index`: index of the film after processing, also that of the glass that it is on (no
+      refraction between the two).
+    - `thickness`: thickness of the film after processing, mm.
     - `index_modulation`: Δn, the amplitude of n + Δn·cos(K·r). Above 0.012 efficiencies of single
       rays are more than 0.03 off by Kogelnik's equations; see `diffraction_efficiency`.
     """
@@ -73,12 +73,12 @@ class VolumeHologram(Module):
     ) -> "VolumeHologram":
         """The reflection hologram that two plane waves in the plane x = 0 record.
 
-        - `wavelength`: of the laser, mm.
+        - `wavelength`: wavelength of the laser, mm.
         - `object_angle`, `reference_angle`: from the normal in the film, rad, both acute: the
           object wave runs along +z, the reference wave along −z. `refracted` makes them of angles
           in glass or air.
-        - `index`, `thickness`: of the film during recording; mm. See `processed` for the changes
-          by development.
+        - `index`, `thickness`: index and thickness (mm) of the film during recording. See
+          `processed` for the changes by development.
         - `index_modulation`: Δn.
         """
         laser = checks.positive("wavelength", wavelength, "mm")
@@ -97,7 +97,7 @@ class VolumeHologram(Module):
         """The hologram after development.
 
         - `shrinkage`: part of the thickness that is lost; the fringes come nearer along the normal.
-        - `index_change`: of the average index; None for none.
+        - `index_change`: change of the average index; None for none.
         """
         shrinkage = checks.real("shrinkage", shrinkage, "parts of the thickness")
         if not checks.is_traced(shrinkage) and not -1 < float(shrinkage) < 1:

@@ -28,8 +28,8 @@ def picture_likelihood(
 ) -> Float[np.ndarray, "y x"]:
     """Logarithm of each pixel's density, up to a constant, the mean of two orders of reading.
 
-    - `picture`: of any unit. Read from the top row and from the bottom row.
-    - `variance`: of the typical error, the picture's unit squared; see `typical_variance`.
+    - `picture`: picture in any unit. It is read from the top row and from the bottom row.
+    - `variance`: variance of the typical error, the picture's unit squared; see `typical_variance`.
     """
     down = _log_density(_errors(picture), variance)
     up = _log_density(_errors(picture[::-1]), variance)
@@ -44,7 +44,7 @@ def typical_variance(picture: Float[np.ndarray, "y x"]) -> float:
 
 
 def _errors(picture: np.ndarray) -> np.ndarray:
-    """Of the predictions of each pixel from those before it."""
+    """Errors of the predictions of each pixel from those before it."""
     shape, (rows, columns) = picture.shape, picture.shape
     padded = np.pad(picture, ((2, 0), (2, 2)), mode="edge")
     seen = [padded[2 + y : 2 + y + rows, 2 + x : 2 + x + columns] for y, x in _BEFORE]
@@ -75,18 +75,18 @@ def _log_density(errors: np.ndarray, variance: float) -> np.ndarray:
 
 
 def _count(reach: int) -> int:
-    """Of the pixels before one within a reach."""
+    """Number of the pixels before one within a reach."""
     return 2 * reach * (reach + 1)
 
 
 def _sum_before(values: np.ndarray, reach: int) -> np.ndarray:
-    """Over the rows above within a reach, and over those before in the same row, (*batch, y, x)."""
+    """Sum over the pixels before each, within a reach: above and in its row, (*batch, y, x)."""
     wide = (2 * reach + 1) * scipy.ndimage.uniform_filter1d(values, 2 * reach + 1, mode="nearest")
     return _sum_of_last(wide, reach, -2) + _sum_of_last(values, reach, -1)
 
 
 def _sum_of_last(values: np.ndarray, reach: int, axis: int) -> np.ndarray:
-    """Of the `reach` entries before each along an axis."""
+    """Sum of the `reach` entries before each along an axis."""
     values = np.moveaxis(values, axis, -1)
     sums = np.cumsum(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach + 1, 0)]), axis=-1)
     size = values.shape[-1]

@@ -55,11 +55,11 @@ class Plan:
     - `dispersion`: whether the indices change with the wavelength.
     - `field_dependent`: False where rows and columns are separated: every column has the ghosts of
       one column, every row those of one row, and the system is `Separable`.
-    - `precision`: of the rays and of the system's numbers.
+    - `precision`: precision of the rays and of the system's numbers.
     - `level`: weight, mm, that counts as 1: the mean over pixels of the sum over all orders.
     - `shares`: errors of the single decisions. `simpler`: predicted ones of `separable`, and of
       `shift-invariant`: a convolution, with the ghosts of the sensor's middle everywhere.
-    - `crosstalk`: as of `colour_system`, of a `ColourCamera`; `level` is then of each channel.
+    - `crosstalk`: argument of `colour_system`, for a `ColourCamera`; `level` then has several.
     """
 
     camera: SeeThroughCamera | ColourCamera
@@ -313,7 +313,7 @@ class _Probe:
         )
 
     def capture(self, **way: Any) -> np.ndarray:
-        """At the pixels, by one way of the `options`."""
+        """Capture at the pixels, by one way of the `options`."""
         rays = self.rays(way["dispersion"] or not self.dispersive, way["precision"], way["smear"])
         return self.seen(rays, way["orders"]).sum(axis=0)
 
@@ -325,7 +325,7 @@ class _Probe:
         return {name: _APART * self._predicted(one, rounded) for name, one in found.items()}
 
     def _predicted(self, capture: np.ndarray, rounded: float) -> float:
-        """`rounded`: what the precision adds, twice: the operator does not round as the probe."""
+        """`rounded`: error by the precision, twice: the operator does not round as the probe."""
         away = capture - self.reference.sum(axis=0)
         largest = float((np.sqrt(self.counts) * np.abs(away)).max()) / self.norm
         return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + 2 * rounded
@@ -378,7 +378,7 @@ class _ColourProbe(_Probe):
         self._refer(self.capture(**best, apart=True), last, seen)
 
     def capture(self, *, apart: bool = False, **way: Any) -> np.ndarray:
-        """At the pixels, (channel, pixel); `apart`: (order, channel, pixel)."""
+        """Capture at the pixels, (channel, pixel), or (order, channel, pixel) with `apart`."""
         total, (channels, primaries), smear = 0.0, self.colours.channels, way["smear"]
         for out, (points, weight) in enumerate(self.ways):
             points, weight = points[:, : way["orders"]], weight[:, :, :, : way["orders"]]
@@ -477,7 +477,7 @@ def _drawn(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _orders_seen(camera, plane, pixels) -> np.ndarray:
-    """For each pixel, a number of orders beyond which every ghost has left the object."""
+    """Number of orders, for each pixel, beyond which every ghost has left the object."""
     rays = trace(camera, jnp.asarray(pixels), plane.distance, 2)
     first, second = np.asarray(rays.points[..., :2], float)
     half = float(plane.pitch) * np.asarray(plane.shape[::-1]) / 2 + float(seen_size(camera, plane))

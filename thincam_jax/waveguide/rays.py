@@ -46,7 +46,7 @@ class Rays(eqx.Module):
     - `weight`: ∫ η²(1−η)^m dλ with m earlier contacts with the hologram, (order, *pixel), mm; 0 for
       rays that are not OK.
     - `guided`: direction cosines (x, y) of the guided light times its index, (*pixel, 2).
-    - `status`: of each, a number of `RayStatus`, (order, *pixel).
+    - `status`: end of each ray, a number of `RayStatus`, (order, *pixel).
     """
 
     points: Float[Array, "order *pixel 3"]
@@ -71,7 +71,7 @@ def trace(
     - `pixels`: (x, y) on the sensor, mm from its middle: (*pixel, 2).
     - `object_distance`: d2, from the plate's front surface, mm; of several planes by `jax.vmap`.
     - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
-    - `extent`: of the object, (x, y) mm from the camera's axis; None is infinite.
+    - `extent`: limits of the object, (x, y) mm from the camera's axis; None is infinite.
 
     The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg
     wavelength of each pixel; the weights include the rest of the band, but not its smear.
@@ -135,7 +135,7 @@ class BraggRays(eqx.Module):
 
 
 def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> BraggRays:
-    """From pixels, (x, y) mm, through lens and rear surface to the top hologram."""
+    """Rays from pixels, (x, y) mm, through lens and rear surface to the top hologram."""
     hologram = camera.screen.hologram
     axes, slope = camera.plate_axes, -pixels / camera.focal_distance
     across = product(slope, axes[:2, :2]) + axes[2, :2]
@@ -172,7 +172,7 @@ class Path(eqx.Module):
 def object_points(
     camera: SeeThroughCamera, rays: BraggRays, distance: Float[Array, ""], orders: int
 ) -> Path:
-    """From the lens to the object, for each order."""
+    """Paths from the lens to the object, for each order."""
     width = camera.screen.glass_thickness
     bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
     crossing = shift(rays.across, camera.screen.glass_index(rays.wavelength))

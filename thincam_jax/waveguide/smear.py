@@ -44,7 +44,7 @@ def trace_band(
     orders: int = 4,
     samples: int = 8,
 ) -> SmearedRays:
-    """As `trace`, for the whole band of each pixel in place of its Bragg wavelength.
+    """Trace the whole band of each pixel in place of its Bragg wavelength.
 
     The light of a pixel and order is divided into `samples` equal parts from one end of the band to
     the other, each at the mean of where it comes from: the mean over the band is exact with one

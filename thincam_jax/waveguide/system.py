@@ -25,7 +25,7 @@ class ObjectPlane(Module):
 
     - `shape`: (rows, columns) of cells.
     - `distance`: d2, from the plate's front surface, mm.
-    - `width`: of the object, mm.
+    - `width`: width of the object, mm.
     - `centre`: (x, y) of its middle from the camera's axis, mm; +y is down.
     """
 
@@ -36,7 +36,7 @@ class ObjectPlane(Module):
 
     @property
     def pitch(self) -> Float[Array, ""]:
-        """Of the cells, mm."""
+        """Side of the cells, mm."""
         return self.width / self.shape[1]
 
 
@@ -59,7 +59,7 @@ class Footprints:
     """The cells that pixels see along y and x, and what part of a pixel's light is from each.
 
     - `first`: index of the first cell, (y or x, *ray). It may lie outside of the object.
-    - `parts`: of that cell and its followers, (y or x, *ray, cell).
+    - `parts`: parts of a pixel's light from that cell and its followers, (y or x, *ray, cell).
     """
 
     first: Int[np.ndarray, "2 *ray"]
@@ -164,7 +164,7 @@ def planes_operator(
     counts: tuple[int, int | None],
     level: float | None = None,
 ) -> Sparse:
-    """`system_operator` of one colour; `level`: what weight, mm, is 1."""
+    """`system_operator` of one colour; `level`: weight, mm, that counts as 1."""
     planes = (plane,) if isinstance(plane, ObjectPlane) else plane
     if not isinstance(planes, Sequence) or not all(isinstance(p, ObjectPlane) for p in planes):
         raise TypeError(f"plane is {checks.shown(plane)}; give a waveguide.ObjectPlane, or several")
@@ -204,7 +204,7 @@ def require_same(what: str, parts: str, shapes: Sequence[tuple[int, ...]]) -> tu
 
 
 def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: float):
-    """H of pixels that see squares of the object of that size, mm; `level`: what weight is 1."""
+    """H of pixels that see squares of the object of that size, mm; `level`: weight that is 1."""
     weight, points = np.asarray(rays.weight), np.asarray(rays.points)
     orders, *pixels, samples, _ = points.shape
     pixels = math.prod(pixels)

@@ -45,7 +45,7 @@ class DeviceConfig(Section):
 
 
 class CameraConfig(DeviceConfig, section(CameraSettings), section(Sensor, only=("pitch",))):
-    """The camera and its settings; `pitch`: of its pixels."""
+    """The camera and its settings; `pitch`: side of its pixels."""
 
     pixel_format: Literal[tuple(BIT_DEPTHS)] = "Mono12"  # pyright: ignore[reportInvalidTypeForm]
 
@@ -70,9 +70,9 @@ class DisplayConfig(
     section(FresnelZoneAperture, only=("fill_factor",)),
     section(Procedure, only=("settle",), defaults={"settle": None}),
 ):
-    """The modulator or monitor; `pitch`: of its pixels; `settle`: left out, it is measured.
+    """The modulator or monitor; `pitch`: side of its pixels; `settle`: measured if left out.
 
-    - `phase_levels`: of a phase modulator, which shows the file's `mask`.
+    - `phase_levels`: levels of a phase modulator, which shows the file's `mask`.
     """
 
     pitch: Length | None = None
@@ -90,7 +90,7 @@ class AcquisitionConfig(section(Procedure, only=("exposure", "timeout", "retries
 class OpticsConfig(Section):
     """The lensless camera; `distance`: from the modulator to the sensor, with the stage at 0.
 
-    - `colours`: of a Bayer format, wavelengths of red, green and blue in place of `wavelength`.
+    - `colours`: wavelengths of red, green and blue of a Bayer format in place of `wavelength`.
     """
 
     wavelength: Wavelength | None = None
@@ -123,7 +123,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
       a screen, of the brightest pixel before a white monitor.
     - `screen`: a see-through camera before a monitor, for a Hadamard plan.
     - `monitor`: where it really stands, before a lensless camera.
-    - `phase_levels`: what a phase modulator really does; default as of the display.
+    - `phase_levels`: true levels of a phase modulator; default those of the display.
     """
 
     sensor: tuple[Count, Count]
@@ -138,8 +138,8 @@ class CaptureConfig(ExperimentConfig):
     """Captures of a rig, `rig: real`, or of a simulated one, `rig: virtual`.
 
     - `display`: a scene needs none; someone covers the camera for dark frames.
-    - `targets`: what stands at the object's distance of a virtual rig, or on its screen's cells,
-      one; or the pictures of a plan of kind pictures, on its cells.
+    - `targets`: targets at the object's distance of a virtual rig, or on its screen's cells, one;
+      or the pictures of a plan of kind pictures, on its cells.
     - `matrix`: with which such pictures, or a scene, are reconstructed: matrix.zarr of a
       calibration's run, or the store of its captures; by `methods`.
     - `mask`: on a phase modulator, in pixels of the display.
@@ -206,7 +206,7 @@ class CaptureConfig(ExperimentConfig):
 
     @property
     def cells(self) -> tuple[int, int] | None:
-        """Of the plan, or those that a virtual rig's scene stands on."""
+        """Cells of the plan, or those that a virtual rig's scene stands on."""
         seen = self.virtual.screen if self.virtual and self.rig == "virtual" else None
         return self.plan.cells if seen is None else seen.object.cells
 

@@ -48,8 +48,9 @@ _MATRIX = (
 class Taken:
     """Captured frames of a store.
 
-    - `seen`: of a Hadamard plan some frames only; its camera is that of a virtual rig.
-    - `labels`: what was shown for each. `seconds`: of the steps of the acquisition, by name.
+    - `seen`: frames, some only of a Hadamard plan; its camera is that of a virtual rig.
+    - `labels`: words for what was shown for each. `seconds`: duration of the acquisition's steps,
+      by name.
     - `exposures`: s. `calibration`: HadamardCaptures or GreyLevels, of such plans.
     """
 
@@ -238,7 +239,7 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
         methods.append(Method(f"{number}", exposures, solver, synthesis, len(phases)))
 
     def target(entry: PictureConfig) -> Target:
-        """Of one light, colours are averaged."""
+        """Target of a picture; in light of one wavelength colours are averaged."""
         seen, cells = optics.object, config.cells if monitor else None
         shown = picture(entry, cells, 3 if optics.colours else 0)
         return Target.of_image(entry.name, shown, seen.distance, seen.width, entry.kind)
@@ -265,9 +266,9 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
 
 
 def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
-    """Of the pictures that a matrix is for, uint8, by name: none of a real rig's scene.
+    """Levels, uint8, of the pictures that a matrix is for, by name: none of a real rig's scene.
 
-    Of a phase modulator those of its mask. **Errors**: ConfigError for what cannot be shown.
+    For a phase modulator those of its mask. **Errors**: ConfigError for what cannot be shown.
     """
     if config.mask is not None:
         table, light, pitch = config.display.phase_levels, config.optics, config.display.pitch
@@ -291,7 +292,7 @@ def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
 
 
 def screen_system(config: CaptureConfig) -> Sparse:
-    """From the cells of a virtual rig to its sensor: 1 where a white monitor is brightest."""
+    """Matrix from a virtual rig's cells to its sensor: 1 where a white monitor is brightest."""
     assert config.virtual is not None and config.virtual.screen is not None
     seen = config.virtual.screen
     plane, (camera,) = build_plane(seen), build_cameras(seen)

@@ -1,1 +1,1 @@
-"""From a design's file to designs found, and what the full simulation says of them."""
+"""Searches of a design's file, and the full simulation of the designs found."""

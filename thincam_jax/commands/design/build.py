@@ -1,4 +1,4 @@
-"""From a design's file to its study, and from what was found to a study's file."""
+"""Study of a design's file, and a study's file of the designs found."""
 
 import numpy as np
 
@@ -107,7 +107,7 @@ def build_designs(config: DesignConfig) -> Study:
 
 
 def _sensor(config: DesignConfig) -> SensorConfig:
-    """Of numbers that the design's file has had checked."""
+    """Section of the sensor, of numbers that the design's file has had checked."""
     sensor = dict(config.sensor)
     if config.noise.electrons is not None:
         sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
@@ -115,7 +115,7 @@ def _sensor(config: DesignConfig) -> SensorConfig:
 
 
 def build_problem(config: DesignConfig, study: Study) -> DesignProblem:
-    """In the precision that JAX is set to; looks at the photographs where the prior needs them."""
+    """Problem in JAX's precision; the photographs are looked at where the prior needs them."""
     space, counts = config.space(), config.search.frequencies.build()
     setup = Setup(
         pitch=config.sensor.pitch,
@@ -142,7 +142,7 @@ def build_objective(asked: SearchConfig) -> AbstractObjective:
 
 
 def _synthesis(config: DesignConfig, design: Design) -> np.ndarray:
-    """Of a design's captures, real weights (channel, capture)."""
+    """Real weights (channel, capture) of a design's captures."""
     phases = design.phases
     return synthesis_matrix(config.reference.synthesis, design.captures // phases, phases)
 
@@ -194,7 +194,7 @@ def _of_captures(config: DesignConfig, problem: DesignProblem, captures: int) ->
 
 
 def with_shots(config: DesignConfig, count: int) -> DesignConfig:
-    """The same search for designs of so many shots.
+    """File of this search for designs of so many shots.
 
     Fewer are the first of the reference; more of them begin as copies of its last, and are free in
     what that is free in.

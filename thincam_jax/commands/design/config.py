@@ -72,7 +72,7 @@ class DesignNoiseConfig(section(SignalNoise, PhotonNoise, defaults=_EITHER)):
         return self
 
     def simulated(self) -> NoiseConfig:
-        """The same of a study."""
+        """This noise in a study."""
         if self.read_noise is not None:
             return NoiseConfig(read_noise=self.read_noise)
         return NoiseConfig(snr_db=self.snr_db, signal_power="without_mean")
@@ -174,7 +174,7 @@ class FreeConfig(Section):
 
 
 def _number(variable: str, given: Any) -> float:
-    """In the package's unit."""
+    """Value in the package's unit."""
     if QUANTITIES[variable].kind:  # a share of the exposure stands alone
         return parse_quantity(given, QUANTITIES[variable].kind)
     if isinstance(given, bool) or not isinstance(given, int | float):
@@ -188,9 +188,9 @@ _EXACT = dict.fromkeys(field.name for field in fields(Tolerances))
 
 
 class TolerancesConfig(section(Tolerances, defaults=_EXACT)):
-    """`thincam_jax.design.Tolerances`: what the reconstruction does not know, of `robust_error`.
+    """Errors of what the reconstruction assumes, for `robust_error`; see `design.Tolerances`.
 
-    `beta`: as a part of itself; `how`: the mean over the tolerances, or the worst of them.
+    `beta`: deviation as a part of β; `how`: the mean over the tolerances, or the worst of them.
     """
 
     how: Literal["mean", "worst"] = "mean"
@@ -205,8 +205,8 @@ class TolerancesConfig(section(Tolerances, defaults=_EXACT)):
 class SearchConfig(section(SearchSettings, only=LENGTH)):
     """Free numbers and their limits, the objective, and the length of the search.
 
-    `band`: of `worst_ratio` and `unevenness`, as parts of half of the pixels' Nyquist frequency.
-    `grid`: points along each side of the landscape.
+    `band`: band of `worst_ratio` and `unevenness`, as parts of half of the pixels' Nyquist
+    frequency. `grid`: points along each side of the landscape.
     """
 
     free: Annotated[tuple[FreeConfig, ...], Field(min_length=1)]
@@ -247,8 +247,8 @@ class TrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))
     - `images`: photographs of scikit-image; their middle square is taken.
     - `reconstruction`: `wiener`, the Wiener synthesis as in the simulation; `linear`, the best
       linear estimate, which knows of the crop; `pnp`, plug and play with the shipped denoiser.
-    - `pixels`: of the sensor's shorter side in training; by default as many as the finest fringes
-      need, and no more than the sensor has.
+    - `pixels`: number of pixels of the sensor's shorter side in training; by default as many as the
+      finest fringes need, and no more than the sensor has.
     - `samples`: even ones over the bounds; descents begin at the best `starts` of these, of the
       search's designs and the reference; `steps` of each.
     """

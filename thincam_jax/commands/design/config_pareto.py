@@ -73,7 +73,7 @@ _SHORT = {"starts": 4, "samples": 128, "steps": 40}
 class ParetoConfig(section(SearchSettings, only=LENGTH, defaults=_SHORT)):
     """Fronts of designs; every point of them is a search over all that is free.
 
-    `samples`, `starts`, `steps`, `solver`: of each of the searches, as of `search`.
+    `samples`, `starts`, `steps`, `solver`: settings of each of the searches, see `search`.
     """
 
     thickness: ThicknessConfig | None = None
@@ -87,7 +87,7 @@ class ParetoConfig(section(SearchSettings, only=LENGTH, defaults=_SHORT)):
         return self
 
     def costs(self, phases: int) -> dict[str, list[float]]:
-        """Of each front: mm; captures, so many phases a shot; electrons."""
+        """Costs of each front: mm; captures, so many phases a shot; electrons."""
         lines = {"thickness": self.thickness, "light": self.light}
         found = {name: line.costs() for name, line in lines.items() if line is not None}
         if self.captures is not None:

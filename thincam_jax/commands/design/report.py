@@ -142,7 +142,7 @@ _LIMIT = (
 
 
 def fronts(design: DesignScores) -> list[Content]:
-    """Of each Pareto front its table and a sentence."""
+    """Table and sentence of each Pareto front."""
     contents: list[Content] = []
     for name, front in ({} if design.pareto is None else design.pareto.fronts).items():
         note = _CAPTURES.format(front.exposure) if name == "captures" else _LIMIT

@@ -29,7 +29,7 @@ class DesignFolder(RunFolder):
     - `config.yaml`: the resolved configuration.
     - `found.yaml`: the reference and the best designs, for `thincam run`.
     - `targets/NAME.json`: the simulation of a finished target; an interrupted design skips these.
-    - `reconstructions-NAME.png`: of the scene of a target, written with its simulation.
+    - `reconstructions-NAME.png`: reconstructions of a target's scene, written with its simulation.
     - `masks.png`, `landscape.png`, `training.png`, `responses.png`, `mtf.png`, `pareto.png`,
       `environment.json`, `report.html`, `design.json`: written at the end.
     """
@@ -79,7 +79,7 @@ class _DesignRun(Run):
         return self.design.simulated(self.search.result)
 
     def simulate(self, target: Target) -> None:
-        """From before an interruption where the designs are still the same."""
+        """Simulate a target, or read its trials from before an interruption of these designs."""
         methods = self.simulated.methods
         self.folder.write("found.yaml", dump_config(as_study_config(self.config, methods)))
         designs = [[list(astuple(e)) for e in method.exposures] for method in methods]

@@ -41,7 +41,7 @@ class SourceConfig(Section):
         return self
 
     def images(self, maker: Any, *side: int) -> Any:
-        """By the functions of a module that makes them of each kind, at a side if it takes one."""
+        """Images by a module's functions, one for each kind, at a side if it takes one."""
         if self.kind == "drawn":
             return maker.drawn(self.seed, self.count, *side)
         if self.kind == "samples":

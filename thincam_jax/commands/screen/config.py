@@ -41,7 +41,7 @@ class ResponseConfig(section(wg.ColourBand)):
 class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
     """Recording of both holograms; angles are in the film, from its normal.
 
-    - `colours`: of a full-colour hologram, the wavelengths of red, green and blue in place of
+    - `colours`: wavelengths of red, green and blue of a full-colour hologram, in place of
       `wavelength`, recorded one after the other at the same angles.
     - `responses`: to these of a sensor whose colours have cross-talk; None where it has none.
     """
@@ -85,13 +85,14 @@ class PlateConfig(section(wg.Screen, without=("hologram",), defaults={"glass_ind
 
 
 class LensConfig(section(wg.SeeThroughCamera, only=("focal_distance", "lens_distance"))):
-    """From sensor to lens (d0), and from lens to the plate (d1)."""
+    """Distances from sensor to lens (d0) and from lens to plate (d1)."""
 
 
 class ScreenMaskConfig(section(ScreenMask, without=("mask",)), MaskConfig):
     """A mask before a bare sensor, in place of the lens, and how its PSFs are computed.
 
-    - `beta`: of a zone plate. `distance`: from sensor to mask; `gap`: from the mask to the plate.
+    - `beta`: curvature of a zone plate. `distance`: from sensor to mask; `gap`: from the mask to
+      the plate.
     """
 
     beside: ClassVar[tuple[str, ...]] = ("distance", "gap", "model", "points", "tolerance")
@@ -163,8 +164,8 @@ class CalibrationConfig(section(Calibration)):
 class SeeThroughConfig(Section):
     """A see-through camera and the cells before it.
 
-    - `orders`: of ghosts; `band_samples`: of the colours about each pixel's Bragg wavelength, None
-      for that one alone.
+    - `orders`: number of ghosts; `band_samples`: samples of the colours about each pixel's Bragg
+      wavelength, None for that one alone.
     """
 
     hologram: HologramConfig
@@ -177,7 +178,7 @@ class SeeThroughConfig(Section):
 
     @property
     def distances(self) -> tuple[float, float]:
-        """From the sensor to the lens or mask, and from there to the plate, mm."""
+        """Distances from the sensor to the lens or mask, and from there to the plate, mm."""
         return self.lens.focal_distance, self.lens.lens_distance
 
 

@@ -138,7 +138,7 @@ class _ScreenRun(Run):
 
 
 def published_figures(targets: Sequence[ScreenTargetConfig]) -> dict[str, dict[str, Any]]:
-    """Of each target, by method."""
+    """Published figures of each target, by method."""
     return {
         target.name: {method: one.build() for method, one in target.published.items()}
         for target in targets

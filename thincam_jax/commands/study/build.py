@@ -1,4 +1,4 @@
-"""From an experiment file to a study: cameras, exposures, noise, targets and methods."""
+"""Study of an experiment file: cameras, exposures, noise, targets and methods."""
 
 import math
 from collections.abc import Callable

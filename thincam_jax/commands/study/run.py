@@ -166,7 +166,7 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
 
 
 def _pictures(target: str, scores: StudyScores) -> tuple[Gallery, Gallery, Picture]:
-    """Of a target: whole, enlarged, and all captures, folded."""
+    """Pictures of a target: whole, enlarged, and all captures, folded."""
     place = f"../images/{slug(target)}--"
     wholes = [
         Picture(f"{place}capture.png", f"{target} as shadows of the mask", "first raw capture"),

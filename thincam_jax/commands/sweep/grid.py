@@ -25,10 +25,10 @@ _WITH_UNIT = re.compile(rf"{_NUMBER}\s*([^\d\s.].*)")
 class Axis:
     """One --grid.
 
-    - `text`: as given, for messages.
-    - `path`: as given; the name of the table's column.
+    - `text`: option that was given, for messages.
+    - `path`: key that was given; the name of the table's column.
     - `places`: the entries that it sets, all to the same value: one, or several where it has a `*`.
-    - `values`: what they are set to, in order.
+    - `values`: values that they are set to, in order.
     """
 
     text: str
@@ -125,7 +125,7 @@ def _range(text: str, values: str) -> tuple[Any, ...]:
 
 
 def _number(value: float) -> int | float:
-    """Without the rounding of the steps: 0.3 for 0.30000000000000004; whole ones as integers."""
+    """Number without the steps' rounding, 0.3 for 0.30000000000000004; whole ones as int."""
     value = float(f"{value:.12g}")
     return int(value) if value.is_integer() else value
 

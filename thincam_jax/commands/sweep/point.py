@@ -28,13 +28,13 @@ _USER_ERRORS = (ConfigError, FileNotFoundError, PermissionError, MemoryError)
 class GridPoint:
     """A configuration of the grid.
 
-    - `key`: what its results are recognised by, from all that they depend on.
+    - `key`: name that its results are recognised by, from all that they depend on.
     - `values`: the swept values by the path of their axis; in mm, rad and rad/mm² where they are
       quantities. Those of a refused point are as given.
     - `config`: the resolved configuration as JSON; None if it is refused.
     - `double`: whether it is computed in double precision.
     - `reason`: why the configuration is refused, in one line.
-    - `warnings`: of one that is not.
+    - `warnings`: warnings about one that is not.
     """
 
     key: str

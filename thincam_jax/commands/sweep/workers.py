@@ -29,7 +29,7 @@ Outcomes = Callable[[Callable, Mapping[str, tuple]], Iterator[tuple[str, Any]]]
 
 
 class Died:
-    """In place of a result: the worker process ended while it computed."""
+    """Placeholder for a result whose worker process ended while it computed."""
 
 
 @contextlib.contextmanager
@@ -114,7 +114,7 @@ def _answer(task: bytes) -> bytes:
 
 
 def _environment(threads: int) -> dict[str, str]:
-    """Of a worker: `threads` for XLA and BLAS each, and no memory of a GPU taken in advance."""
+    """Environment of a worker: `threads` for XLA and BLAS each, no GPU memory taken in advance."""
     names = ("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     wanted = {**dict.fromkeys(names, str(threads)), "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     return {**wanted, **os.environ}
@@ -180,7 +180,7 @@ async def _identity(address: str) -> Any:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the log of distributed, which tells of each worker that dies or restarts."""
+    """Silence the log of distributed, which tells of each worker that dies or restarts."""
     names = [n for n in logging.root.manager.loggerDict if n.split(".")[0] == "distributed"]
     levels = {name: logging.getLogger(name).level for name in ("distributed", *names)}
     for name in levels:

@@ -56,7 +56,7 @@ class Outcome:
     """End of a run.
 
     - `done`, `total`: frames in the store, and of the plan.
-    - `found`: what was measured before the first frame: exposure, settle time.
+    - `found`: settings measured before the first frame: exposure, settle time.
     - `recovered`: the errors that a retry resolved, one line each.
     - `seconds`: spent on "move", "show", "settle", "flush", "trigger", "check", "keep".
     """

@@ -50,7 +50,7 @@ class Pattern:
 
     @property
     def label(self) -> str:
-        """In a figure's title: β and φ of a mask, the number of a Hadamard frame."""
+        """Label in a figure's title: β and φ of a mask, the number of a Hadamard frame."""
         if self.kind == "fza":
             return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f} rad"
         if self.kind in ("picture", "pixels"):
@@ -310,7 +310,7 @@ def alignment(
 ) -> Plan:
     """Marks, one at a time, in rows and columns on a square of the side `spread`, mm.
 
-    - `size`: diameter of a mark, mm. `frames`: of each.
+    - `size`: diameter of a mark, mm. `frames`: number of frames of each.
     """
     rows, columns = (np.linspace(-spread / 2, spread / 2, count).tolist() for count in marks)
     every = [Pattern("mark", {"x": x, "y": y, "size": size}) for y in rows for x in columns]
@@ -330,7 +330,7 @@ def scene(
 
     - `mask`: shown meanwhile, such as a `zone_plate`.
     - `exposures`: s, in place of the settings' one.
-    - `frames`, `dark_frames`: of each exposure; all dark ones come last.
+    - `frames`, `dark_frames`: numbers of frames of each exposure; all dark ones come last.
     """
     every = tuple(dataclasses.replace(settings, exposure=float(one)) for one in exposures)
     every = every or (settings,)

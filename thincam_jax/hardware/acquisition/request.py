@@ -50,15 +50,18 @@ class PlanRequest:
     """Captures that a plan is asked for.
 
     - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
-      `profile`, `phase`: of all of them.
+      `profile`, `phase`: width, profile and phase of all of them.
     - `distances`: mask-sensor distances (method_a) or those of
       what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
     - `cells`: rows and columns of cells on a monitor.
-    - `order`, `display`: of the Hadamard patterns.
+    - `order`, `display`: order and display of the Hadamard patterns.
     - `marks`: rows and columns of marks on a square of the side `spread` about a monitor's middle,
-      each with the diameter `size`; `map`: what is fitted to them, a "homography" if it is tilted.
-    - `frames`: of each picture, mark or level, whose mean counts; of each exposure of a scene.
-    - `exposures`: of a scene, in place of the camera's; several are merged to one linear image.
+      each with the diameter `size`; `map`: map that is fitted to them, a "homography" if it is
+      tilted.
+    - `frames`: frames of each picture, mark or level, whose mean counts; of each exposure of a
+      scene.
+    - `exposures`: exposures of a scene, in place of the camera's; several are merged to one linear
+      image.
     - `dark_frames`: in all; they are spread over the plan. Of a scene, for each exposure.
 
     **Errors**: FieldError for what the kind lacks or does not take.
@@ -123,7 +126,7 @@ class PlanRequest:
         """Whether each rule of a file is broken, what is wrong then, and where.
 
         - `given`: names of the sections that the file has, and of the keys of its optics. `pitch`:
-          of its display.
+          pixel pitch of its display.
         """
         name, kind = self.kind, f"a plan of kind {self.kind}"
         named = "optics", "matrix", "alignment", "mask"
@@ -160,7 +163,7 @@ class PlanRequest:
 
     @property
     def series(self) -> HadamardSeries:
-        """Of a plan of kind hadamard."""
+        """Series of patterns of a plan of kind hadamard."""
         assert self.cells is not None
         return HadamardSeries(self.cells, self.order, self.display, self.dark_frames)
 

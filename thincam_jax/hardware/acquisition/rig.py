@@ -81,7 +81,7 @@ def open_rig(
     """Open the devices of a rig and home its stage; a context manager.
 
     - `drivers`: name and options of the driver of the camera, the display and, if any, the stage.
-    - `pitch`: of the display's pixels, mm, for which zone plates are drawn.
+    - `pitch`: pitch of the display's pixels, mm, for which zone plates are drawn.
     - `virtual`: simulated optics, whose virtual devices are opened in place of real ones.
     - `pictures`: those of a plan of pictures or pixels, by name.
     - `turns_phase`: the display is a phase modulator, which shows no black: someone covers the

@@ -45,7 +45,7 @@ class Procedure:
     - `reopen_wait`: s before a disconnected device is reopened.
     - `saturated`: largest allowed share of saturated pixels.
     - `position_tolerance`: mm between the commanded position and the one reached.
-    - `exposure`: as "given" with the plan, or found before the first frame, "auto": the first
+    - `exposure`: "given" with the plan, or found before the first frame, "auto": the first
       settings' by the search `auto_exposure`; the others keep their ratio to it.
     """
 

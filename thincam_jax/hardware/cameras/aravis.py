@@ -35,7 +35,7 @@ class AravisCamera(FeatureCamera):
 
     @dataclass(frozen=True)
     class Options:
-        """`name`: as `arv-tool-0.8` lists the camera, its address, or "" for the first one."""
+        """`name`: name that `arv-tool-0.8` lists, the camera's address, or "" for the first one."""
 
         name: str = ""
 

@@ -30,7 +30,7 @@ class PylablibCamera(Camera):
     class Options:
         """`camera`: class in `pylablib.devices`, such as "Thorlabs.ThorlabsTLCamera".
 
-        - `arguments`: of that class, by name, such as {serial: "12345"}.
+        - `arguments`: arguments of that class, by name, such as {serial: "12345"}.
         - `settings`, `attributes`, `grabber_attributes`: for its `apply_settings`,
           `set_all_attribute_values` and `set_all_grabber_attribute_values`. With {trigger_mode:
           ext} frames wait for the camera's external trigger.

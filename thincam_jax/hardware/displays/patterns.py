@@ -112,7 +112,7 @@ def mask_pattern(
 def on_cells(levels: np.ndarray, shape: tuple[int, int], side: int | None = None) -> np.ndarray:
     """Levels of cells (row, column), centred on the display.
 
-    `side`: of a cell in pixels; None: the largest that fits.
+    `side`: side of a cell in pixels; None: the largest that fits.
 
     **Errors**: ValueError where a cell would be smaller than a pixel.
     """

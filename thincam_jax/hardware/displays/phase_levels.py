@@ -20,8 +20,8 @@ from thincam_jax.lensless.masks import AbstractMask, SampledMask
 class PhaseLevels:
     """Measured phases of a modulator's levels, at a wavelength.
 
-    - `phases`: rad, of levels in equal steps from 0 to 255: of all 256, or of fewer, between which
-      they are interpolated linearly.
+    - `phases`: phases, rad, of levels in equal steps from 0 to 255: of all 256, or of fewer,
+      between which they are interpolated linearly.
     - `wavelength`: at which they were measured, mm.
     - `tolerance`: width of the interval about a phase in which a level has to lie, rad.
     - `gap`: amplitude of the dead space between pixels over theirs, of phase 0: zero order.
@@ -108,9 +108,10 @@ class PhaseLevels:
     def mask(
         self, levels: np.ndarray, pitch: float, wavelength: float, fill_factor: float = 1.0
     ) -> SampledMask:
-        """What levels (y, x) are at a wavelength: the mask of a camera's model.
+        """Mask that levels (y, x) make at a wavelength, for a camera's model.
 
-        - `pitch`: of the pixels, mm. `fill_factor`: of a pixel's area, which turns the phase.
+        - `pitch`: pitch of the pixels, mm. `fill_factor`: part of a pixel's area that turns the
+          phase.
         """
         given = {"fill_factor": fill_factor, "gap": self.gap or None}
         return SampledMask(self.field(levels, wavelength), pitch, **given)

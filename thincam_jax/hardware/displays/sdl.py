@@ -152,7 +152,7 @@ class SdlDisplay(Screen):
 
 
 def _names() -> list[str]:
-    """Of the monitors, by their numbers."""
+    """Names of the monitors, by their numbers."""
     count = sdl2.SDL_GetNumVideoDisplays()
     return [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
 

@@ -9,7 +9,7 @@ from thincam_jax.hardware.errors import NotFound
 
 
 class Shutter(Display):
-    """For a camera before which nothing is shown: a black pattern asks to cover it, by hand.
+    """Shutter by hand for a camera without a display: a black pattern asks to cover it.
 
     A pattern is one level. The camera is taken for open at first, except after `forget`.
 

@@ -57,11 +57,11 @@ class ModulatorOptics:
     by the table `phases`, of which no light is left where all levels are 0: the camera is covered.
     The PSF of the pixels is `pixelated_psf`.
 
-    - `pixel_pitch`: of the modulator, mm; its middle is on the axis.
+    - `pixel_pitch`: pixel pitch of the modulator, mm; its middle is on the axis.
     - `distance`: from modulator to sensor, mm, at the stage's position 0.
     - `electrons`: per second and pixel for each mm² of open aperture before a white scene.
     - `fill_factor`: open fraction of a modulator pixel's area.
-    - `phases`: of a phase modulator's levels, and its dead space.
+    - `phases`: phases of a phase modulator's levels, and its dead space.
     - `aperture`: rows and columns in the middle of a phase modulator that are lit; None: all.
     """
 
@@ -321,7 +321,7 @@ def cells_seen(
 class MonitorPose:
     """Where a monitor stands, beside the middle of the object's plane.
 
-    - `x`, `y`, `z`: of its middle, mm; z is away from the camera.
+    - `x`, `y`, `z`: place of its middle, mm; z is away from the camera.
     - `rotation`: clockwise as seen; `turn`: its right side, `tilt`: its lower side is farther.
     """
 
@@ -338,11 +338,12 @@ class MonitorPose:
     def homography(
         self, distance: float, pixel: float = 1.0, cell: float = 1.0
     ) -> Float[np.ndarray, "3 3"]:
-        """From the monitor's pixels to cells on the plane at a distance, (x, y) from the middles.
+        """Homography from the monitor's pixels to cells of a plane, (x, y) from the middles.
 
         - `pixel`, `cell`: their sides, mm; negative for an image that is turned by 180°.
 
-        That of a pinhole in the mask's middle: the PSF's own change with the depth is left out.
+        Projection through a pinhole in the mask's middle: the PSF's own change with the depth is
+        left out.
         """
         angles = self.rotation, self.tilt, -self.turn
         turned = Rotation.from_euler("zxy", angles).as_matrix()

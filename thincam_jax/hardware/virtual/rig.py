@@ -23,7 +23,7 @@ _KEPT = 8  # cached images
 
 @dataclass(frozen=True)
 class Electronics:
-    """From electrons to counts: shot and read noise, an offset, saturation at the full well.
+    """Conversion of electrons to counts: shot and read noise, offset, saturation at the full well.
 
     - `full_well`: electrons of the largest count without gain; `read_noise`: in electrons.
     - `offset`: counts of a dark frame at 12 bits.

@@ -101,7 +101,7 @@ def ssim(
 
 
 def _pair(image, reference) -> tuple[np.ndarray, np.ndarray]:
-    """Both as float64 of one shape, finite."""
+    """Image and reference as float64 of one shape, finite."""
     image, reference = numbers("image", image), numbers("reference", reference)
     if image.shape != reference.shape:
         raise ValueError(

@@ -49,8 +49,8 @@ def usaf_contrast(
     - `image`: the chart upright at the centre of the image, in any linear unit of light.
     - `elements`: from `usaf1951_elements`.
     - `pixels_per_chart`: the width of the whole chart in pixels, margin included, not rounded.
-    - `polarity`: of the chart that was imaged, as for `usaf1951`. Bars count as 1 and the ground as
-      0 for both, so a resolved dark bar has positive contrast too.
+    - `polarity`: polarity of the chart that was imaged, as for `usaf1951`. Bars count as 1 and the
+      ground as 0 for both, so a resolved dark bar has positive contrast too.
 
     The image is first brought to the ideal chart's scale by the magnitude of the least-squares gain
     of `align`. An image that is a negative of its chart keeps its reversed contrast. Noise shrinks

@@ -53,7 +53,8 @@ class AbstractOperator(AnyRank):
 
         It is approached from below: after 30 iterations to a few per cent where singular values
         crowd at the top, to all digits where the largest is isolated. A step of a gradient method
-        should keep a margin. `dtype`: of the iteration, by default that of the operator's numbers.
+        should keep a margin. `dtype`: type of the iteration, by default that of the operator's
+        numbers.
         """
         if iterations < 1:
             raise ValueError(f"iterations = {iterations} finds no norm; give at least 1")
@@ -121,8 +122,8 @@ def adjoint_error(
     r"""Distance of an operator's adjoint from its transpose.
 
     :math:`|\langle A f, g\rangle - \langle f, A^T g\rangle| / (\|A f\|\,\|g\|)` for white random f
-    and g. A right adjoint gives some multiple of the rounding error, a wrong one about
-    1/√(numbers in g) or more. `dtype`: of f, by default that of the operator's numbers.
+    and g. A right adjoint gives some multiple of the rounding error, a wrong one about 1/√(numbers
+    in g) or more. `dtype`: type of f, by default that of the operator's numbers.
 
     **Errors**: ValueError if a map returns another shape than `out_shape` and `in_shape`.
     """

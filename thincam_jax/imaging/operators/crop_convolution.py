@@ -118,7 +118,7 @@ class CropConvolution(AbstractOperator):
         return jnp.mean(plane_mean(squared_modulus(self.spectrum), self.window[1]))
 
     def with_channels_and_planes(self) -> "CropConvolution":
-        """The same map on images (…, channel, plane, m, n), its planes summed."""
+        """This map on images (…, channel, plane, m, n), its planes summed."""
         leading = self.spectrum.ndim - 2
         if leading == 2 and self.summed == 1:
             return self

@@ -136,7 +136,7 @@ def _mean_power(operator: LowRank):
 class LowRankFit(eqx.Module):
     """An operator for a grid of PSFs, and its errors.
 
-    - `truncation_error`: of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.
+    - `truncation_error`: error of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.
     - `interpolation_error`: an estimate of the same between the points. Of measured PSFs a quarter
       of the error where every other point is omitted and interpolated, infinite for grids too small
       for it; of a camera's field, what the polynomials leave of the finest zones' phase, and
@@ -163,9 +163,9 @@ def low_rank_psf(
 
     - `psfs`: (grid y, grid x, k, l): PSFs of a grid of points, each centred on the field sample's
       position on the sensor: its pixel k//2, l//2.
-    - `pitch`, `sensor_shape`, `field_shape`: as `CropConvolution` takes them. Where k or l does not
+    - `pitch`, `sensor_shape`, `field_shape`: arguments of `CropConvolution`. Where k or l does not
       fit them, a row or column of zeros is appended.
-    - `tolerance`: of the truncation, relative L2 over the whole grid.
+    - `tolerance`: error of the truncation that is allowed, relative L2 over the whole grid.
     - `positions`: rows and columns of the field that the points lie on, increasing, also between
       its samples; by default spread evenly from the field's first to its last. Beyond the
       outermost points their PSFs are kept.

@@ -26,7 +26,7 @@ class Matrix(AbstractPixelMap):
     **Arguments**
 
     - `matrix`: H, (capture pixel, image pixel).
-    - `in_shape`, `out_shape`: of the image and of the capture.
+    - `in_shape`, `out_shape`: shapes of the image and of the capture.
     """
 
     matrix: Float[Array, "i j"]

@@ -61,13 +61,13 @@ class ReducedMatrix(AbstractOperator):
 
     @classmethod
     def of(cls, matrix: Any, in_shape: Shape | None = None) -> "ReducedMatrix":
-        """Of H: `Matrix`, `Sparse`, one of these `Scaled` (as `ScreenFit.system` gives it), or an
+        """Reduced form of H: `Matrix`, `Sparse`, one `Scaled` (`ScreenFit.system`), or an
         array to be sliced by rows (NumPy, Zarr, SciPy's CSR).
 
         Takes 2·rows·n² + 25·n³ operations once: minutes for 193600 × 4096 on two cores, in 1 GB
         beside H.
 
-        - `in_shape`: of the image; operators know it.
+        - `in_shape`: shape of the image; operators know it.
 
         **Errors**: ValueError where H is no table of finite numbers, or of another width.
         """

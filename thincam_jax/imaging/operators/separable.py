@@ -20,8 +20,8 @@ class SeparableModes(eqx.Module):
     - `rows`: V, (m, m), and `columns`: W, (n, n), an orthonormal vector a column.
     - `values`: (m, n), the singular values of A, exactly for one term. For several, the roots of
       the diagonal of AᵀA in modes that suit the mean of the terms.
-    - `seen_rows`, `seen_columns`: of one term: V and W as captured by the sensor, the left
-      singular vectors (y, m) and (x, n); zero where no light arrives.
+    - `seen_rows`, `seen_columns`: V and W of one term as captured by the sensor, the left singular
+      vectors (y, m) and (x, n); zero where no light arrives.
     """
 
     rows: Float[Array, "m m"]
@@ -46,7 +46,7 @@ class SeparableModes(eqx.Module):
 class Truncated(eqx.Module):
     """A sum of fewer terms, and its error on captures of white scenes, ‖difference‖_F/‖A‖_F.
 
-    `errors`: the same for 1, 2, … terms.
+    `errors`: errors with 1, 2, … terms.
     """
 
     operator: "Separable"
@@ -164,8 +164,8 @@ class Separable(AbstractOperator):
     def truncated(self, tolerance: Number = 0.0, *, terms: int | None = None) -> Truncated:
         """The nearest sum of fewest terms (Van Loan and Pitsianis 1993), and its error.
 
-        - `tolerance`: of the error, relative Frobenius norm; it makes the number of terms known
-          only outside of jit.
+        - `tolerance`: error that is allowed, relative Frobenius norm; it makes the number of terms
+          known only outside of jit.
         - `terms`: their number in place of a tolerance.
 
         **Errors**: ValueError for a tolerance that is not 0 ≤ … < 1, and for less than one term.

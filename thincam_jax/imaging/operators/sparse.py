@@ -34,7 +34,7 @@ class Sparse(AbstractPixelMap):
 
     - `matrix`: H, (capture pixel, image pixel): a matrix or array of `scipy.sparse`, or a `BCOO` of
       `jax.experimental.sparse` without batch or dense axes. Entries at the same place add up.
-    - `in_shape`, `out_shape`: of the image and of the capture.
+    - `in_shape`, `out_shape`: shapes of the image and of the capture.
     """
 
     values: Float[Array, " entry"]

@@ -141,7 +141,7 @@ def sample_images() -> tuple[str, ...]:
 def resize(
     image: Num[ArrayLike, "..."], shape: tuple[int, int]
 ) -> Float64[np.ndarray, "y x *channel"]:
-    """The same picture on `shape` = (rows, columns) pixels; (y, x) or (y, x, channel).
+    """This picture on `shape` = (rows, columns) pixels; (y, x) or (y, x, channel).
 
     Both pictures cover the same field, border to border. If an axis shrinks, a Gaussian removes
     frequencies beyond the new Nyquist limit and the result is interpolated linearly; if none does,
@@ -220,7 +220,8 @@ def placed(
 ) -> Float64[np.ndarray, "y x *channel"]:
     """The image smaller, moved and turned on black of its own shape.
 
-    - `width`, `centre`: of what it is on, in parts of its width; `centre` is (y, x), y downwards.
+    - `width`, `centre`: width and centre of the image, in parts of the width of what it is on;
+      `centre` is (y, x), y downwards.
     - `rotation`: clockwise as it is seen, rad, about its own middle.
     """
     if (width, *centre, rotation) == (1.0, 0.0, 0.0, 0.0):

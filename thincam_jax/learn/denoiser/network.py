@@ -167,10 +167,11 @@ def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
 
 @dataclasses.dataclass(frozen=True)
 class NetworkCard:
-    """What a denoiser was trained with.
+    """Options, pictures and scores of a denoiser's training.
 
     - `images`: names, sums and licences of the pictures by their use.
-    - `scores`: loss of each check, on pictures held out; `cpu_seconds`: of the last training.
+    - `scores`: loss of each check, on pictures held out; `cpu_seconds`: CPU time of the last
+      training, s.
     """
 
     options: DenoiserOptions

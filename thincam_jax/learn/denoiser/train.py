@@ -43,8 +43,8 @@ _JUDGED = 2**31
 class DenoisingLessons:
     """Training set of a denoiser.
 
-    - `pictures`: of each step; `held_out`: those that judge the network, which no step sees;
-      by default the same.
+    - `pictures`: pictures of each step; `held_out`: those that judge the network, which no step
+      sees; by default the same.
     - `batch`: crops of a step; `crop`: pixels of their sides; `judged`: batches of a check.
     - `cameras`: how many are drawn, behind which the network learns inside the steps of
       `PlugAndPlay`, too; 0: none.

@@ -104,6 +104,6 @@ class DenoisingUNet(eqx.Module):
 
 
 def _kernel(inputs: int, outputs: int, side: int, key: PRNGKeyArray) -> Array:
-    """By He: keeps the variance through a ReLU."""
+    """Random kernel by He's rule, which keeps the variance through a ReLU."""
     spread = (2 / (side**2 * inputs)) ** 0.5
     return spread * jax.random.normal(key, (outputs, inputs, side, side))

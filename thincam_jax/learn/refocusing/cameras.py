@@ -28,10 +28,10 @@ _MARGIN = 8
 class Stand(eqx.Module):
     """Where the planes of a stack stand, one of them at a commanded distance.
 
-    - `inverse`: 1/t, 1/mm, the nearest first; `number`: of the commanded plane.
+    - `inverse`: 1/t, 1/mm, the nearest first; `number`: index of the commanded plane.
     - `place`: 1 where a plane stands among the places relative to the commanded one, which is the
       middle one of 2·planes − 1; (place, plane).
-    - `position`: of the commanded distance in the range of 1/t, from −1, far, to 1, near.
+    - `position`: place of the commanded distance in the range of 1/t, from −1, far, to 1, near.
     """
 
     inverse: Float[Array, " plane"]
@@ -60,7 +60,7 @@ class RefocusCamera(eqx.Module):
     - `planes`: number of planes of a stack, evenly spaced in 1/t.
     - `pupil`: diameter D in mm of the lens that focused images are rendered for; default the width
       of the mask.
-    - `model`: of the PSFs, see `thincam_jax.psf`.
+    - `model`: model of the PSFs, see `thincam_jax.psf`.
 
     The PSF is kept on `support` pixels, the mask's shadow from the nearest point with a margin; the
     widest lens blur reaches `largest_blur` pixels from its middle. Both are sizes, so that the

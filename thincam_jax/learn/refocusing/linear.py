@@ -51,8 +51,8 @@ class LinearStep(eqx.Module):
     ) -> Complex[Array, "plane v u"]:
         """Correction of the planes' spectra for a residual of the capture.
 
-        `variance`: of the residual's noise per sensor pixel, in the units of the residual; `place`:
-        1 where a plane stands, default each at its own.
+        `variance`: variance of the residual's noise per sensor pixel, in the units of the residual;
+        `place`: 1 where a plane stands, default each at its own.
         """
         dtype = variance.dtype
         window, field = planes.window, planes.operator.field_shape

@@ -22,7 +22,7 @@ _LEAST = 1e-5  # of an image's mean square: an error below it counts for nothing
 class Examples(eqx.Module):
     """Input and target of a U-Net for one scene or, (element, …), for many.
 
-    - `images`: as of `prepared`, for planes at `stand`.
+    - `images`: images by `prepared`, for planes at `stand`.
     - `stack`: light of the planes; what stands between two is shared out between them.
     - `image`, `all_in_focus`: in units of the scene's mean; `inverse`: 1/t, 1/mm.
     """
@@ -80,7 +80,7 @@ def loss(prior: UNet, given: Examples) -> tuple[Float[Array, ""], Parts]:
 
     - `focus`, `all_in_focus`: ½ ln of the mean squared error over the image's mean square; a
       decrease by 0.115 is 1 dB, however bright or hard the scene is.
-    - `planes`: the same of the stack.
+    - `planes`: that of the stack.
     - `distance`: −ln of the Laplace density of 1/t at each pixel, in steps of the planes, with the
       error that the network expects.
     """
@@ -91,7 +91,7 @@ def loss(prior: UNet, given: Examples) -> tuple[Float[Array, ""], Parts]:
 
 
 def _parts(prior: UNet, one: Examples) -> Parts:
-    """Of one element."""
+    """Parts of the loss of one element."""
     stand = one.stand
     cleaned = read_images(prior, one.images, stand)
     step = (stand.inverse[0] - stand.inverse[-1]) / (stand.inverse.size - 1)

@@ -56,9 +56,9 @@ class Cleaned(eqx.Module):
     """Input of a U-Net from the images of a step, in units of the scene's mean.
 
     - `stack`: (plane, y, x), radiance.
-    - `image`: as a lens sees the scene that is focused on the commanded distance.
-    - `all_in_focus`: as a pinhole sees it.
-    - `share`: of each plane in what a pixel shows, (plane, y, x), sum 1.
+    - `image`: view by a lens that is focused on the commanded distance.
+    - `all_in_focus`: view by a pinhole.
+    - `share`: share of each plane in what a pixel shows, (plane, y, x), sum 1.
     - `spread`: mean absolute error of 1/t that is expected, in steps of the planes.
     """
 
@@ -128,7 +128,8 @@ class RefocusNetwork(eqx.Module):
     """A network and the camera whose captures it takes.
 
     - `weights`: all that is learnt.
-    - `planes`: of its camera; not learnt, and rebuilt from the camera when a network is loaded.
+    - `planes`: planes of its camera; not learnt, and rebuilt from the camera when a network is
+      loaded.
 
     Captures are (*batch, y, x) in any unit; `deviation` is the standard deviation of their noise
     per pixel in the same unit, one number or one for each capture. Images come back as the field is

@@ -15,7 +15,7 @@ class Planes(eqx.Module):
     Images and captures are in units in which both are about 1: a capture is divided by the light
     that a uniform scene of radiance 1 sends on average, `unit`.
 
-    - `camera`: what they are of.
+    - `camera`: camera before which they stand.
     - `operator`: from the image (y, x) of the plane in the middle of the range to the capture.
     - `uniform`: its capture where its radiance is 1 everywhere.
     """

@@ -38,7 +38,7 @@ class NetworkScores:
 class RefocusTraining:
     """A trained network, its scores beside those of the linear start, and a batch to look at.
 
-    - `reading`: what the network reads from the captures of `batch`.
+    - `reading`: reading of the captures of `batch` by the network.
     """
 
     trained: Trained
@@ -61,7 +61,7 @@ class RefocusTraining:
         return Table(("network", *both, "residual\nover noise"), rows, (2, 3, 2, 3, 2))
 
     def finding(self) -> str:
-        """What the training gains, in words."""
+        """Gain by the training, in words."""
         after, before = self.scores.focus_psnr_db, self.linear.focus_psnr_db
         return f"focused images have {after:.2f} dB, the linear start {before:.2f} dB"
 
@@ -111,5 +111,5 @@ def score(readings: Sequence[Reading], batches: Sequence[Batch]) -> NetworkScore
 
 
 def finite(value: Any) -> float | None:
-    """To four decimals; None where it is not finite, which JSON has no number for."""
+    """Number to four decimals; None where it is not finite, which JSON has no number for."""
     return round(float(value), 4) if np.isfinite(value) else None

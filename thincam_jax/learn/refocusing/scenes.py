@@ -77,7 +77,7 @@ class Scene(eqx.Module):
     """Layers from the front to the back, in directions: pixel (i, j) is one ray through the mask.
 
     - `radiance`: F, (layer, y, x); `cover`: α, (layer, y, x), 0 to 1.
-    - `share`: of a pixel in each flat part of its layer, (layer, part, y, x), sum 1.
+    - `share`: share of a pixel in each flat part of its layer, (layer, part, y, x), sum 1.
     - `inverse`: 1/t of the parts, 1/mm, (layer, part).
     """
 
@@ -290,6 +290,6 @@ def _cut_out(numbers, images, shape):
 
 
 def _seen_past(cover):
-    """Of layers from the front: the share of each pixel that those in front leave free."""
+    """Share of each pixel that the layers in front leave free; layers from the front."""
     left = jnp.cumprod(1 - cover, axis=0)
     return jnp.concatenate([jnp.ones_like(cover[:1]), left[:-1]])

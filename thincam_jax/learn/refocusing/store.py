@@ -62,7 +62,7 @@ def load(
     **Arguments**
 
     - `path`: a file, or "shipped", the network that comes with the package.
-    - `cameras`: what takes the captures: the camera; the camera with its light, as `Cameras`;
+    - `cameras`: imaging model of the captures: the camera; the camera with its light, as `Cameras`;
       or all that the network was trained for. Its numbers are compared, to single precision.
 
     **Errors**: CheckpointError, one line, for a damaged file, and for another camera with the

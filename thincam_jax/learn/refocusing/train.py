@@ -40,7 +40,7 @@ _JUDGED = 2**31
 class Lessons:
     """Training set of a network.
 
-    - `source`: the images; `scenes`: what is drawn of them.
+    - `source`: the images; `scenes`: options of the scenes drawn from them.
     - `batch`: scenes of a step, taken out of a pool of so many batches, which is drawn once.
     - `judged`: batches that judge the network at each check, drawn of `held_out` images, which no
       step sees; by default of the same.
@@ -71,7 +71,7 @@ class Lessons:
         return list(self.drawn(network, seed, self.judged, _JUDGED))
 
     def task(self, network: RefocusNetwork, seed: int) -> Task:
-        """Of the last U-Net of a network; those before it are as they are."""
+        """Task of training the last U-Net of a network; those before it stay as they are."""
         pool = [examples(network, one) for one in self.drawn(network, seed, self.pool)]
         pool = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pool)
         judged = [examples(network, one) for one in self.validation(network, seed)]

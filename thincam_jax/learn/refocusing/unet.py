@@ -39,7 +39,7 @@ class Residual(eqx.Module):
 
 
 class UNet(eqx.Module):
-    """From images (input, y, x) to images (output, y, x); untrained it gives zeros.
+    """U-Net from images (input, y, x) to images (output, y, x); untrained it gives zeros.
 
     Blocks of 2×2 pixels become channels first, and pixels again at the end, so that the widest
     convolutions run on a quarter of the pixels. Each level halves the resolution by averaging; on

@@ -155,7 +155,7 @@ class Learned(AbstractSolver):
 
 
 def doubt(consistency: float) -> str:
-    """In words, where an image does not explain its capture; else nothing."""
+    """Warning in words where an image does not explain its capture; else empty."""
     if consistency < _DOUBTED:
         return ""
     return (

@@ -1,4 +1,4 @@
-"""Which model is the cheapest that is accurate enough, found from one-dimensional fields."""
+"""The cheapest model that is accurate enough, found from one-dimensional fields."""
 
 from thincam_jax.lensless.accuracy.select import Prediction as Prediction
 from thincam_jax.lensless.accuracy.select import Selection as Selection

@@ -64,7 +64,7 @@ class Numbers:
     - `epsilon`: |k|ε of the highest order k.
     - `first_order`, `second_order`: phases kε·kβ(w/2)² and (kε)²·kβ(w/2)² at the edge, rad.
     - `edge_zone`: √(λd/M), mm.
-    - `largest_phase`: of the zones and of the edge waves on the sensor, rad.
+    - `largest_phase`: largest phase of the zones and of the edge waves on the sensor, rad.
     """
 
     epsilon: float
@@ -154,7 +154,7 @@ def weighted(
     row_weights: Float[np.ndarray, " row"],
     column_weights: Float[np.ndarray, " column"],
 ) -> Factors:
-    """The same from the complex factors of Σ Re{Y X}."""
+    """Real factors, scaled by the roots of the weights, of Σ Re{Y X}."""
     rows, columns = rows * np.sqrt(row_weights), columns * np.sqrt(column_weights)
     # Re{YX} = Re Y Re X − Im Y Im X.
     return Factors(
@@ -281,7 +281,7 @@ class MaskProbe:
         return distance(found, self.reference) / self.scale
 
     def rayleigh_sommerfeld(self, method: PsfMethod) -> float:
-        """The same for the direct sum, from a few pixels: where it aliases, no line shows it."""
+        """Relative error of the direct sum, from a few pixels: no line shows where it aliases."""
         few = [spread(count, _FEW) for count in self.shape]
         with allow("float64"):
             mask, pitch, path = self.given["float64"]

@@ -44,7 +44,7 @@ _CONVERSION = 1e7
 class Prediction:
     """Error and cost of a model.
 
-    - `method`: as `psf` takes it in place of the model's name.
+    - `method`: model with its settings, which `psf` takes in place of the model's name.
     - `predicted_error`: relative L2 over the sensor, at least the true one in 99 % of cameras.
     - `cost`: operations and peak memory.
     """

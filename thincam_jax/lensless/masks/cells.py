@@ -55,7 +55,7 @@ class AbstractCellMask(AbstractFactoredMask):
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
-        """Of cells that alternate, cycles/mm."""
+        """Frequency of alternating cells, cycles/mm."""
         return 0.5 / self.cell
 
     def terms(self, wavelength: Number | None = None) -> MaskTerms:

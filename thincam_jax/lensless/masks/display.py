@@ -38,7 +38,7 @@ class DisplayedMask(AbstractFactoredMask):
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
-        """Of pixels that alternate, cycles/mm."""
+        """Frequency of alternating pixels, cycles/mm."""
         return 0.5 / self.pixel_pitch
 
     def terms(self, wavelength: Number | None = None) -> MaskTerms:

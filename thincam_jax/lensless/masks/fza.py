@@ -128,7 +128,7 @@ class FresnelZoneAperture(AbstractFactoredMask):
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
-        """Of the zones at the middle of the edges, cycles/mm; of the farther ones."""
+        """Local zone frequency at the middle of the farther edges, cycles/mm."""
         return edge_frequency(self.beta, jnp.maximum(*self.extent))
 
     @property
@@ -186,7 +186,7 @@ class FresnelZoneAperture(AbstractFactoredMask):
 
 
 def edge_frequency(beta: Any, width: Any) -> Any:
-    """Of an aperture's zones, β·width/(2π), cycles/mm: d(βr²)/dr = 2πf at r = width/2."""
+    """Zone frequency β·width/(2π) at an aperture's edge, cycles/mm: d(βr²)/dr = 2πf there."""
     return beta * width / (2 * np.pi)
 
 

@@ -159,7 +159,7 @@ class PhaseMask(AbstractMask):
         return turn_phasor(turns) * as_complex(jnp.real(passed))
 
     def heights(self, grid: Grid) -> Float[Array, "y x"]:
-        """On a grid: between the centres, or the mean of the cells in each sample."""
+        """Heights on a grid, mm: between the cells' centres, or the cells' mean in each sample."""
         if self.interpolation == "bilinear":
             return self._at(self.height, grid)
         return jnp.real(SampledMask(self.height, self.pitch, centre=self.centre).sample(grid))
@@ -172,7 +172,7 @@ class PhaseMask(AbstractMask):
 class MaskBlank(Module):
     """Blank of a relief: its cells and its material.
 
-    - `shape`: (rows, columns) of cells. `pitch`: of the cells, mm.
+    - `shape`: (rows, columns) of cells. `pitch`: side of the cells, mm.
     - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.
 
     ```python

@@ -115,7 +115,7 @@ class RadialMask(AbstractMask):
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
-        """Of rings that alternate, cycles/mm."""
+        """Frequency of alternating rings, cycles/mm."""
         return 0.5 / jnp.min(self.ring)
 
     def sample(self, grid: Grid, wavelength: Number | None = None) -> Float[Array, "y x"]:

@@ -29,7 +29,7 @@ def diffuser(
     bumps have the rms curvature :math:`2\sqrt3\,\sigma/\ell^2`, and caustics are sharp near their
     focal length :math:`\ell/[\sqrt6\,(n-1)s]`.
 
-    - `key`: of `jax.random`, or a seed.
+    - `key`: key of `jax.random`, or a seed.
     - `correlation_length`: ℓ, mm, at least two cells.
     - `rms_slope`: s along an axis, dimensionless. The lowest height is 0.
 
@@ -83,9 +83,10 @@ def voronoi_fresnel(
     centroids of their cells: these become even in size and round, and the PSF a set of equal,
     unevenly spaced points (Optics Express 30, 45807).
 
-    - `key`: of `jax.random`, or a seed. `sites`: number of lenses. `relaxations`: steps of Lloyd's.
+    - `key`: key of `jax.random`, or a seed. `sites`: number of lenses. `relaxations`: steps of
+      Lloyd's.
     - `focal_length`: f, mm: the mask-sensor distance for far objects.
-    - `wavelength`: of the design, mm.
+    - `wavelength`: wavelength that the lenses are designed for, mm.
 
     **Sampling.** The rim of a lens turns the phase by r/(λf) cycles/mm, which the cells hold up to
     1/(2 pitch): lenses that reach farther are refused.

@@ -156,7 +156,7 @@ def random_cells(
     """A mask of cells that are open or closed at random; of no low rank.
 
     `width`, `height` (mm; None for a square) are whole numbers of cells; `open_fraction` is the
-    chance of a cell to be open. `key`: of `jax.random`, or a seed.
+    chance of a cell to be open. `key`: key of `jax.random`, or a seed.
 
     ```python
     import thincam_jax as tc

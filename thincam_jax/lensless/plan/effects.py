@@ -40,7 +40,7 @@ def effects_of(
 
 
 def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect:
-    """Of the PSF at the corner of the widest plane, against that of the axis."""
+    """Change of the PSF from the axis to the corner of the widest plane."""
     finest = camera.mask.finest_frequency
     if finest is None:
         note = "size not known for this mask: compare psf(..., at=(y, x)) with that of the axis"
@@ -74,7 +74,7 @@ def _left_out(size: float, tolerance: float, what: str) -> str:
 
 
 def _shot_noise(camera: LenslessCamera, tolerance: float) -> Effect:
-    """Of the brightest pixel, 1/√N of its N electrons."""
+    """Relative shot noise of the brightest pixel: 1/√N for its N electrons."""
     sensor = camera.sensor
     if sensor.electrons is not None:
         note = "size not known: the brightest pixel depends on the scene's light"

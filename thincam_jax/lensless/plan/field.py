@@ -100,7 +100,7 @@ def _has_chirps(mask: AbstractMask) -> bool:
 
 
 def _change(seen: SeenScene, method: PsfMethod, wavelength: float, distance: float) -> _Change:
-    """Of one wavelength and distance, from the PSFs of four points along each axis."""
+    """Change of H over the field at one wavelength and distance, by four points an axis."""
     probe = seen.probe
 
     def transfer(at: tuple[float, float] | None = None) -> Complex[np.ndarray, " k"]:
@@ -121,7 +121,7 @@ def _change(seen: SeenScene, method: PsfMethod, wavelength: float, distance: flo
 
 
 def _errors(seen: SeenScene, changes: list[_Change]) -> tuple[float, float]:
-    """Of the capture with the PSF and the light of the axis, and with its PSF alone."""
+    """Relative errors of the capture with the axis' PSF and light, and with its PSF alone."""
     tangents = tangents_of(seen.camera, seen.field_shape)
     lit = seen.total * np.asarray(light_over_field(seen.camera.sensor, *tangents))
     dimmed = image_spectrum(lit - seen.total, seen.frequencies)

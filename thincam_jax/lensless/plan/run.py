@@ -33,18 +33,18 @@ class Plan:
     - `camera`: that it was made for.
     - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
       batch as a whole.
-    - `method`: of the PSFs, as `psf` takes it.
+    - `method`: method of the PSFs, which `psf` takes.
     - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
     - `mixing`: (distance, plane) weights: the PSF of a plane is this sum of the computed ones, so
       that planes are merged before they are convolved.
     - `wavelengths`, `weights`: wavelengths in mm that are computed, and their shares of the light.
-    - `scene_distances`, `scene_wavelengths`, `scene_weights`: of the
-      scene that the plan was made for.
+    - `scene_distances`, `scene_wavelengths`, `scene_weights`: distances and light of the scene that
+      the plan was made for.
     - `field_shape`: samples of the largest projected plane on the sensor's pitch.
     - `padded_shape`: window of the convolutions.
-    - `cost`, `full_cost`: of the plan and of computing every plane and wavelength.
+    - `cost`, `full_cost`: cost of the plan, and of computing every plane and wavelength.
     - `shares`: predicted errors of the single decisions.
-    - `effects`: what the capture holds and what it does not.
+    - `effects`: effects that the capture holds and those that it leaves out.
 
     ```python
     import thincam_jax as tc

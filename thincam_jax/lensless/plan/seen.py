@@ -70,7 +70,7 @@ class SeenScene:
 
     @functools.cached_property
     def power(self) -> Float[np.ndarray, " k"]:
-        """Of the whole scene, times the area of each frequency."""
+        """Power spectrum of the whole scene, times the area of each frequency."""
         light = np.sum(np.abs(self.spectra.sum(axis=0)) ** 2, axis=0)
         return light * self.frequencies.weights
 
@@ -113,7 +113,7 @@ class SeenScene:
         return _MARGIN * self.crop * math.sqrt(energy / self.capture_energy)
 
     def relative_of_all(self, error: Complex[np.ndarray, " k"]) -> float:
-        """The same for an error of the PSF that all planes share.
+        """Relative error of the capture by an error of the PSF that all planes share.
 
         The planes' errors add up with their signs, or, should these not cancel, by their squares:
         the larger of the two.
@@ -123,7 +123,7 @@ class SeenScene:
 
     @functools.cached_property
     def capture_energy(self) -> float:
-        """Of the capture, at the wavelength in the middle of the light."""
+        """Energy of the capture, at the wavelength in the middle of the light."""
         middle = float(np.quantile(self.wavelengths, 0.5, method="nearest"))
         capture = sum(
             self.probe.quick(middle, distance, self.rough) * spectrum
@@ -150,7 +150,7 @@ class SeenScene:
         return zone / (math.pi * width)
 
     def _points(self, method: PsfMethod) -> int:
-        """Of the field that have PSFs of their own, of a quarter that is mirrored."""
+        """Number of field points with PSFs of their own, in a quarter that is mirrored."""
         tolerance = method.field_tolerance
         if tolerance is None or tolerance >= 1:
             return 1
@@ -162,7 +162,7 @@ class SeenScene:
         return psf_cost(self.camera.mask, self.kernel_grid, method)
 
     def cost(self, method: PsfMethod, planes: int, colours: int) -> Cost:
-        """Of a capture from so many PSFs, for all planes of the scene.
+        """Cost of a capture from `planes`·`colours` PSFs, for all planes of the scene.
 
         Over the field, of as many PSFs and convolutions as its points, those off both axes as the
         others, which they are dearer than.

@@ -171,7 +171,7 @@ def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
 def _inclined(
     ray: ChiefRay, centre: Float[Array, "2"], plane: Grid, path: Path
 ) -> Complex[Array, "y x"]:
-    """The same of a point off the axis: 1 at the mask's middle, without the chief ray's carrier."""
+    """Wave of a point off the axis: 1 at the mask's middle, without the chief ray's carrier."""
     y, x = plane.y[:, None] - centre[0], plane.x - centre[1]
     nearness = ray.cosine / path.object_distance
     along, rho2 = ray.down * y + ray.across * x, y**2 + x**2
@@ -232,7 +232,7 @@ def within(mask: AbstractMask, plane: Grid) -> AbstractMask:
 def _frequencies(
     shape: tuple[int, ...], pitch: Float[Array, ""]
 ) -> tuple[Float[Array, "v 1"], Float[Array, " u"]]:
-    """Of the DFT, in its order, along y and along x."""
+    """Frequencies of the DFT, in its order, along y and along x."""
     v, u = (jnp.fft.ifftshift(centred_frequencies(n, pitch)) for n in shape)
     return v[:, None], u
 

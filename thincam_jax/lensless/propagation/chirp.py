@@ -37,7 +37,7 @@ _SLOW_PHASE = 3.0
 
 @dataclass(frozen=True)
 class _Degrees:
-    """Of the polynomials and series, enough for a precision."""
+    """Degrees of the polynomials and series, enough for a precision."""
 
     near: int
     far: int
@@ -213,7 +213,7 @@ def _near_slope(precision, primals, tangents):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _far(y, precision: Precision):
-    """The same for large z, times πz, in y = 1/(πz²)."""
+    """Auxiliary Fresnel functions f, g for large z, times πz, in y = 1/(πz²)."""
     terms = _DEGREES[precision].far
     f, g = (_polynomial(series[:terms], y**2) for series in (_SERIES_F, _SERIES_G))
     return f, y * g

@@ -25,7 +25,7 @@ class ChirpSum(eqx.Module):
     centre: Float[Array, "2"]
 
     def sample(self, grid: Grid, *, pixel_integration: bool) -> SeparableSum:
-        """On a grid: at the pixel centres, or averaged over the pixels (Fresnel integrals)."""
+        """Samples at a grid's pixel centres, or averaged over its pixels (Fresnel integrals)."""
         # Both axes at once: half as much to compile.
         points = jnp.concatenate([grid.y - self.centre[0], grid.x - self.centre[1]])
         curvatures = self.curvatures[:, None]

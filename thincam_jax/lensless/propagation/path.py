@@ -38,8 +38,8 @@ class Path(Module):
     - `distance`: d, mm, > 0.
     - `object_distance`: t, mm, > 0; infinity is a plane wave.
     - `at`: (y, x) of the point, mm; of a plane wave, the tangents of its angles. None on the axis.
-    - `sine`: of a path along one axis, see `along_axes`: of the ray's angle in the plane of that
-      axis; None where the ray is the axis.
+    - `sine`: sine of the ray's angle in the plane of one axis, for a path along it, see
+      `along_axes`; None where the ray is the axis.
     - `skew`: whether the point is, or may be, off both of the mask's axes.
     - `follows`: whether the middle of the sensor's samples is where the ray through the mask's
       plane at (0, 0) meets it, in place of the axis.
@@ -106,7 +106,7 @@ class Path(Module):
         return -self.distance * self._tangents
 
     def chief_ray(self, centre: Float[Array, "2"]) -> "ChiefRay | None":
-        """Of a mask with this centre (y, x), mm; None on the axis."""
+        """Ray from the point through a mask's `centre` (y, x), mm; None on the axis."""
         if self.at is None:
             return None
         slopes = centre / self.object_distance - self._tangents
@@ -149,7 +149,7 @@ class Path(Module):
 
     @property
     def _tangents(self) -> Float[Array, "2"]:
-        """Of the angles at which the point is seen from the axis."""
+        """Tangents of the angles (y, x) at which the point is seen from the axis."""
         assert self.at is not None
         infinite = jnp.isinf(self.object_distance)
         return self.at / jnp.where(infinite, 1.0, self.object_distance)

@@ -160,7 +160,7 @@ def _disc_field(a: Float[Array, ""], b: Float[Array, ""], rho: Float[Array, "*at
 
 
 def _interpolated(values: Float[Array, " n"], place: Float[Array, "*at"]) -> Float[Array, "*at"]:
-    """Of degree 5, between samples; the first of a place's six is its whole part."""
+    """Values between samples, of degree 5; the first of a place's six samples is its whole part."""
     whole = jnp.floor(place)
     part, index = place - whole, whole.astype(jnp.int32)
     total = jnp.zeros_like(place)

@@ -109,7 +109,7 @@ def axis_fields(
 def cell_shadows(
     edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
 ) -> tuple[Complex[Array, "cell n"], Complex[Array, "edge n"]]:
-    """Of constant cells: where each is lit, and the wave of each edge (`edge_wave`)."""
+    """Shadows of constant cells: where each is lit, and the wave of each edge (`edge_wave`)."""
     offset = -path.detour(x - edges[:, None])
     lit = (offset[:-1] < 0) & (offset[1:] >= 0)  # as the waves' own steps have it
     return as_complex(lit.astype(x.dtype)), edge_wave(path.fresnel_curvature, offset)

@@ -128,7 +128,7 @@ def _chirp(b, x, half) -> Complex[Array, "..."]:
 
 @_chirp.defjvp
 def _chirp_slope(primals, tangents):
-    """By the values at the ends; ∂/∂b by parts. Half the time of Fresnel integrals' slopes."""
+    """Slope by the values at the ends, ∂/∂b by parts; half the time of Fresnel integrals'."""
     b, x, half = primals
     b_dot, x_dot, half_dot = tangents
     value = _chirp(b, x, half)

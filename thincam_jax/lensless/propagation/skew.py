@@ -46,7 +46,7 @@ def _curvatures(zones, ray, path: Path):
 
 
 def _shared(matrix, curvatures) -> Float[Array, ""]:
-    """What the axes share of an order's curvature, at most."""
+    """Largest part of an order's curvature that the axes share."""
     shared = matrix[2] ** 2 / ((curvatures + matrix[0]) * (curvatures + matrix[1]))
     return jnp.max(jnp.abs(shared))
 

@@ -37,9 +37,9 @@ def locate_mark(
 ) -> Place | None:
     """Shift (x, y) of the PSF in a frame of one mark, pixels; None where noise hides it.
 
-    - `psf`: of a point on the axis; the even number of pixels by which it is wider than the frame
-      is the range of the search, half of it on each side.
-    - `radius`: of the mark's image, pixels; 0 for a point.
+    - `psf`: PSF of a point on the axis; the even number of pixels by which it is wider than the
+      frame is the range of the search, half of it on each side.
+    - `radius`: radius of the mark's image, pixels; 0 for a point.
 
     The covariance is White's, which needs not know the noise, and that of the sampling.
     """
@@ -75,9 +75,10 @@ def locate_mark(
 class Alignment:
     """Place of a display's pixels on the object's plane, as `fit_alignment` finds it.
 
-    - `shape`, `pitch`: of the display's pixels, mm.
-    - `unknowns`, `covariance`: of a similarity a, b, x, y, for (x + a u − b v, y + b u + a v); of a
-      homography its first eight entries, row by row. u, v: mm from the display's middle.
+    - `shape`, `pitch`: number (rows, columns) and pitch (mm) of the display's pixels.
+    - `unknowns`, `covariance`: parameters and their covariance, of a similarity a, b, x, y, for (x
+      + a u − b v, y + b u + a v); of a homography its first eight entries, row by row. u, v: mm
+      from the display's middle.
     - `marks`, `used`: that were shown; that agree with the map.
     - `residual`: root mean square distance of these from the map, mm.
     """
@@ -123,7 +124,7 @@ class Alignment:
     def place(self, levels: UInt8[np.ndarray, "row column"], width: float) -> np.ndarray:
         """Levels of the display, uint8, that show a picture about the object plane's middle.
 
-        - `width`: of the picture on the object's plane, mm.
+        - `width`: width of the picture on the object's plane, mm.
         """
         fine = _PARTS * self.shape[0], _PARTS * self.shape[1]
         to_cell = to_indices(levels.shape, width / levels.shape[1]) @ _matrix(self.unknowns)
@@ -216,6 +217,6 @@ def _at_middle(unknowns: np.ndarray) -> np.ndarray:
 
 
 def to_indices(shape: tuple[int, int], pitch: float = 1.0) -> Float[np.ndarray, "3 3"]:
-    """From places (x, y), from the middle, to indices (column, row) of samples of a pitch."""
+    """Matrix from places (x, y) about the middle to indices (column, row) of samples of a pitch."""
     rows, columns = shape
     return np.array([[1 / pitch, 0, (columns - 1) / 2], [0, 1 / pitch, (rows - 1) / 2], [0, 0, 1]])

@@ -37,7 +37,7 @@ class HadamardCaptures:
 
     - `series`: the patterns shown.
     - `sensor_shape`: (rows, columns).
-    - `bits`: of the camera; None: any numbers.
+    - `bits`: bits of the camera; None: any numbers.
     - `exposure`: time, s, if known.
     - `stored_at`: place in the store of each frame of the series; None: the same order.
     """
@@ -153,7 +153,7 @@ def create_captures(
 ) -> CaptureWriter:
     """Create a store for the captures of a calibration.
 
-    - `bits`: of the camera, up to 16, for whole counts; None: any numbers, in float32.
+    - `bits`: bits of the camera, up to 16, for whole counts; None: any numbers, in float32.
     - `exposure`: time, s, for the record.
 
     **Errors**: CaptureStoreError where something is at `path` already.
@@ -228,8 +228,8 @@ def simulate_captures(
     """Simulate the captures of a known camera and write them to a store.
 
     - `operator`: from the cells, 1 is white, to the sensor, in counts (`Scaled` sets the exposure).
-    - `deviation`: of white noise, and `offset`: the dark level, in counts. For a writer with `bits`
-      the counts are rounded and clipped.
+    - `deviation`: standard deviation of white noise, and `offset`: the dark level, in counts. For a
+      writer with `bits` the counts are rounded and clipped.
 
     **Errors**: ValueError where the operator's shapes are not those of the cells and the sensor.
     """

@@ -56,8 +56,8 @@ def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
 class Synthesis(eqx.Module):
     """Weighted sum of captures at several phases: its real part, and an imaginary one if complex.
 
-    - `phases`: of each capture, rad, added to the mask's.
-    - `weights`: of the captures in each part.
+    - `phases`: phase of each capture, rad, added to the mask's.
+    - `weights`: weights of the captures in each part.
     """
 
     phases: Float[Array, " shot"]
@@ -172,11 +172,11 @@ class FitProblem(eqx.Module):
     """The data of `residual`.
 
     - `start`: the state of zero steps.
-    - `image`: the measured one.
-    - `weight`: of the residuals.
+    - `image`: measured image.
+    - `weight`: weight of the residuals.
     - `scale`: the step of each unknown that changes the image by `STEP` (Marquardt's scaling,
       without which 1 % of β, many rad, would be damped like 1 % of a rad).
-    - `names`, `pixel_integration`: as in `unknown_names` and `psf`; static.
+    - `names`, `pixel_integration`: result of `unknown_names` and argument of `psf`; static.
     """
 
     start: FitState

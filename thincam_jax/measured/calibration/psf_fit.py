@@ -68,11 +68,12 @@ class PsfFit(Module):
     - `object_distance`: t, mm; `wavelength`: λ, mm; `background` and `gain`: image = background +
       gain·h, in the image's unit.
     - `names`: the numbers that were fitted, the order of `correlation`.
-    - `values`, `standard_errors`: of each of them, in mm, rad/mm², rad and the image's unit. The
-      errors are those of white noise of the residual's own strength, √(σ²(JᵀJ)⁻¹), or those by
-      which 64 parts of the image disagree, where that is more: the residual is then not noise, and
-      what the model leaves out may have moved the numbers further still.
-    - `correlation`: of their errors from noise.
+    - `values`, `standard_errors`: value and error of each of them, in mm, rad/mm², rad and the
+      image's unit. The errors are those of white noise of the residual's own strength,
+      √(σ²(JᵀJ)⁻¹), or those by which 64 parts of the image disagree, where that is more: the
+      residual is then not noise, and what the model leaves out may have moved the numbers further
+      still.
+    - `correlation`: correlation of their errors from noise.
     - `residual`: measured − model, (y, x); complex where the image is.
     - `status`: "ok"; "ambiguous", where the image does not hold a number: two cannot be told apart
       (`AMBIGUOUS`: a correlation above 0.999), the error of one is above 3 %, above 0.5 % where the
@@ -81,7 +82,7 @@ class PsfFit(Module):
       moved a number by more than a tenth of its standard error. The first that applies, from the
       last to the first.
     - `reasons`: one line for each thing that is not as it should be.
-    - `iterations`: of the least squares.
+    - `iterations`: number of iterations of the least squares.
     """
 
     camera: LenslessCamera
@@ -146,11 +147,12 @@ def fit_psf(
     **Arguments**
 
     - `psf_image`: (y, x) on the camera's sensor, linear in irradiance, in any unit.
-    - `weights`: of a picture that is a sum Σ w_k g_k of captures at several phases: each phase φ_k
-      (rad, on top of the mask's) and its w_k. A complex picture without is fringe-scanned as the
-      thesis does, (g(3π/2) − g(π/2)) + j(g(0) − g(π)): `FRINGE_SCANNED`. Where the weights add up
-      to 0 there is no background left, and none is fitted. Where the picture is explained only by
-      the negative phases, these are fitted and `reasons` says that the phases run backwards.
+    - `weights`: weights of a picture that is a sum Σ w_k g_k of captures at several phases: each
+      phase φ_k (rad, on top of the mask's) and its w_k. A complex picture without is fringe-scanned
+      as the thesis does, (g(3π/2) − g(π/2)) + j(g(0) − g(π)): `FRINGE_SCANNED`. Where the weights
+      add up to 0 there is no background left, and none is fitted. Where the picture is explained
+      only by the negative phases, these are fitted and `reasons` says that the phases run
+      backwards.
     - `camera`: with a `FresnelZoneAperture`; its numbers are the start.
     - `object_distance`: t, mm, from the mask, or infinity; `wavelength`: λ, mm.
     - `search`: the numbers to fit, and how far from the camera's; by default `PsfSearch()`.

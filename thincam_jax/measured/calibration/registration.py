@@ -32,9 +32,10 @@ _WEIGHT = 1e3  # of residuals, so that the solver's initial damping of 1 is weak
 class Registration(Module):
     """Result of `estimate_registration`.
 
-    - `scale`: of the image over the reference; `shift`: (y, x), pixels.
+    - `scale`: size of the image over that of the reference; `shift`: (y, x), pixels.
     - `scale_error`, `shift_error`: their standard errors.
-    - `correlation`: of the image with the registered reference where they overlap; 1 is perfect.
+    - `correlation`: correlation of the image with the registered reference where they overlap; 1 is
+      perfect.
     - `registered`: the reference, scaled and shifted onto the image.
     - `status`: "ok"; "poor_fit" where the correlation is under 0.5; "not_converged".
     - `reasons`: one line for each problem.
@@ -88,7 +89,7 @@ def estimate_registration(
     - `search`: relative search range, at most 0.5.
     - `smoothing`: σ, in pixels of the reference, of a Gaussian filter of both images, which keeps
       noise and interpolation from biasing the result to whole pixels; 0: none.
-    - `max_steps`: of Levenberg-Marquardt.
+    - `max_steps`: highest number of steps of Levenberg-Marquardt.
 
     **Validity.** Both must show mostly the same part of the scene: what one shows beyond the edges
     of the other is ignored, but what is occluded counts.
@@ -281,7 +282,7 @@ def _report(
 
 
 def _standard_errors(pair: Pair, unknowns: Array) -> np.ndarray:
-    """Of the unknowns, from (JᵀJ)⁻¹ S (JᵀJ)⁻¹ with S = Σ_block (Jᵀr)(Jᵀr)ᵀ."""
+    """Standard errors of the unknowns, from (JᵀJ)⁻¹ S (JᵀJ)⁻¹ with S = Σ_block (Jᵀr)(Jᵀr)ᵀ."""
     jacobian, values = (np.asarray(v) for v in _linearised(unknowns, pair))
     scores = jacobian * values[..., None]
     rows, columns = (n - n % _BLOCK for n in values.shape)

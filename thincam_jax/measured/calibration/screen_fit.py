@@ -87,8 +87,8 @@ class GhostPositions(eqx.Module):
     """Object points seen by pixels: a dot on a monitor, and the pixels lit by its ghosts.
 
     - `pixels`: (x, y) on the sensor, mm from its middle, (ghost, 2).
-    - `points`: of the object, (x, y) mm from its middle, (ghost, 2).
-    - `orders`: of each ghost; 0 is the image.
+    - `points`: points of the object, (x, y) mm from its middle, (ghost, 2).
+    - `orders`: order of each ghost; 0 is the image.
     - `deviation`: standard deviation of the points, mm.
     """
 
@@ -110,11 +110,12 @@ class GhostPositions(eqx.Module):
 class ScreenFit(Module):
     """Result of `fit_screen`.
 
-    - `camera`, `plane`: as given, with the fitted parameters. `gain`: ratio of the matrix to the
+    - `camera`, `plane`: those given, with the fitted parameters. `gain`: ratio of the matrix to the
       model's.
-    - `values`, `standard_errors`: of the fitted parameters. The errors are √(σ²(JᵀJ)⁻¹) with the
-      residual's own σ for a matrix, the given one for positions, without errors of the model.
-    - `correlation`: of the errors, in the order of `values`.
+    - `values`, `standard_errors`: values and errors of the fitted parameters. The errors are
+      √(σ²(JᵀJ)⁻¹) with the residual's own σ for a matrix, the given one for positions, without
+      errors of the model.
+    - `correlation`: correlation of the errors, in the order of `values`.
     - `explained`: fraction of the measured squares that the model explains.
     - `status`: "ok"; "ambiguous", where the data do not distinguish some parameters; "poor_fit";
       "not_converged". The last that applies.
@@ -193,7 +194,7 @@ def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
 
 
 class _Smear(eqx.Module):
-    """Of each order and pixel; it changes little with the screen, and is renewed for each blur.
+    """Smear of each order and pixel: it changes little with the screen; renewed for each blur.
 
     - `offsets`: mm, of equal parts of the band from the Bragg wavelength's point.
     - `band`: weight of the band, of which edges of holograms cut off a part; its mean is that of
@@ -205,7 +206,7 @@ class _Smear(eqx.Module):
     bragg: Array
 
     def weight(self, bragg: Array) -> Array:
-        """Of the bands where those of the Bragg wavelengths have become `bragg`."""
+        """Weights of the bands where those of the Bragg wavelengths have become `bragg`."""
         grown = jnp.where(self.bragg > 0, bragg / jnp.where(self.bragg > 0, self.bragg, 1), 1)
         return grown * self.band
 
@@ -217,8 +218,8 @@ def _no_smear() -> _Smear:
 class _Problem(eqx.Module):
     """Data of the least squares.
 
-    `names`: of the parameters; `count`: number of orders. `unit`: of steps. `scale`: one over the
-    residual's unit. `full`: mean weight of a pixel. `smear`: of each pixel's band.
+    `names`: names of the parameters; `count`: number of orders. `unit`: unit of steps. `scale`: one
+    over the residual's unit. `full`: mean weight of a pixel. `smear`: smear of each pixel's band.
     """
 
     start: _State
@@ -268,11 +269,11 @@ def fit_screen(
 
     - `measured`: H from `recover_matrix`, or `GhostPositions`.
     - `camera`, `plane`: initial values; the plane as in the measurement of H.
-    - `parameters`: of "glass_thickness", "lens_distance", "focal_distance", "index" (of film and
-      glass), "slant" (of the fringes' normal from the plate's), "tilt" (of the plane of recording
-      about the plate's normal), "plate_x", "plate_y" (the plate's own tilt, about x and y),
-      "shrinkage" (further, of the film), "film_thickness", "index_modulation", "object_distance",
-      "object_x", "object_y". The gain of a matrix is always fitted. All others are held.
+    - `parameters`: any of "glass_thickness", "lens_distance", "focal_distance", "index" (of film
+      and glass), "slant" (of the fringes' normal from the plate's), "tilt" (of the plane of
+      recording about the plate's normal), "plate_x", "plate_y" (the plate's own tilt, about x and
+      y), "shrinkage" (further, of the film), "film_thickness", "index_modulation",
+      "object_distance", "object_x", "object_y". A matrix' gain is always fitted. Others are held.
     - `orders`: number of ghosts. `samples`: parts of the band of each pixel and order, as in
       `system_operator`; None for a matrix without smear, such as a simulated one.
 

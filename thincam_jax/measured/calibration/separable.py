@@ -142,8 +142,8 @@ def fit_separable(
       out, do not distinguish P X Qᵀ from P G X H Qᵀ.
     - `start`: from stripes or from the design of the camera (`separable_operator`), with the
       number of terms to fit.
-    - `iterations`: at most, with each weight. `tolerance`: of the change of the residual, relative
-      to the captures.
+    - `iterations`: at most, with each weight. `tolerance`: change of the residual, relative to the
+      captures, at which they end.
 
     **Errors**: ValueError for numbers and sizes that do not fit.
 
@@ -194,14 +194,14 @@ def fit_separable(
 
 
 def _held_out_errors(images, captures, pair) -> np.ndarray:
-    """Of the images held out and of their captures."""
+    """Relative errors of the images held out and of their captures."""
     of_each = _image_error(images, captures, pair), _residual(images, captures, pair)
     return np.array([float(error) for error in of_each])
 
 
 @jax.jit
 def _residual(images, captures, pair):
-    """Of captures, relative."""
+    """Relative residual of captures."""
     seen = jnp.einsum("kym,jmn,kxn->jyx", pair[0], images, pair[1], precision="highest")
     size = jnp.sqrt(jnp.sum(captures**2))
     return jnp.sqrt(jnp.sum((seen - captures) ** 2)) / jnp.where(size > 0, size, 1)

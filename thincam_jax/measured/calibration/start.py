@@ -34,7 +34,7 @@ class PsfSearch:
       the sensor's shorter side.
     - `pixel_integration`: average h over each pixel, as a sensor does. Without, the waves from the
       far rim, up to 10 turns a pixel, are aliased, and d is then only as good as the start.
-    - `max_steps`: of Levenberg-Marquardt.
+    - `max_steps`: highest number of steps of Levenberg-Marquardt.
     """
 
     parameters: tuple[str, ...] = ("beta", "phase", "centre", "distance", "background", "gain")

@@ -41,7 +41,7 @@ class FocusCurves:
     """Focus measure of each region over the sweep, and its maxima.
 
     - `labels`: (region,), `curves`: (region, distance).
-    - `peaks`: of all regions in the order of the labels, each region's highest first.
+    - `peaks`: maxima of all regions in the order of the labels, each region's highest first.
     """
 
     labels: tuple[int, ...]
@@ -73,7 +73,8 @@ def find_distances(
     - `regions`: whole numbers (y, x), 0 for the background; see `object_regions`. By default the
       whole field is one region (1): several objects are then found only if they are further apart
       than `axial_resolution`.
-    - `prominence`: of a second maximum, relative to the curve's range; the highest is always given.
+    - `prominence`: least prominence of a second maximum, relative to the curve's range; the highest
+      is always given.
     - `measure`, `smoothing`: see `focus_measure`.
 
     Eager: the result holds plain numbers.
@@ -259,5 +260,5 @@ def depth_of_colours(
 
 
 def _taken(stack, index):
-    """Of a stack (n, …), the entry `index` (…) at each pixel."""
+    """Entry `index` (…) of a stack (n, …) at each pixel."""
     return jnp.take_along_axis(stack, index[None], axis=0)[0]

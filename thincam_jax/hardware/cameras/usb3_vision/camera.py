@@ -33,9 +33,12 @@ class Usb3VisionCamera(FeatureCamera):
 
     @dataclass(frozen=True)
     class Options:
-        """`serial`: of the camera, if there are several; `backend`: a `usb.backend.IBackend` other
-        than libusb's; `compare_clocks`: False for a camera whose frames and registers have
-        different clocks."""
+        """Options of the camera.
+
+        - `serial`: serial number of the camera, if there are several.
+        - `backend`: a `usb.backend.IBackend` other than libusb's.
+        - `compare_clocks`: False for a camera whose frames and registers have different clocks.
+        """
 
         serial: str = ""
         backend: Any = None
