@@ -10,8 +10,9 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from thincam_jax._core.grids import same_parity
 from thincam_jax.imaging.operators.crop_convolution import middle_corner, place
 from thincam_jax.reconstruction.coarse import coarser
 from thincam_jax.reconstruction.imaging_model import Cameras
@@ -26,8 +27,9 @@ from thincam_jax.reconstruction.splittings import admm_method
 # Smooth residual over that of the noise from which on light may come from outside, and the most of
 # it that stays if it does.
 _SUSPECTED, _STAYS = 1.5, 0.7
-# Least share of the light that counts, and the share that may stay outside of the field named.
-_COUNTS, _BEYOND = 0.05, 0.01
+# Part of the field's brightness that is an object, not haze that explains shading; the least share
+# of the light that counts, and the share that may stay outside of the field named.
+_BRIGHT, _COUNTS, _BEYOND = 0.2, 0.05, 0.01
 _HALVED, _SCHEDULE = 2, Schedule(50, 3e-3, adapt_until=25, settled=3e-2)
 
 
@@ -39,10 +41,16 @@ class OutsideLight:
     field_shape: tuple[int, int]
 
     def __str__(self) -> str:
-        return (
-            f"{100 * self.share:.0f} % of the light comes from outside of the field: "
-            f"give field_shape={self.field_shape}"
-        )
+        return f"{self._comes} of the field: give field_shape={self.field_shape}"
+
+    @property
+    def taken(self) -> str:
+        """Sentence where the image has that field by default."""
+        return f"{self._comes} of the sensor's field: the image has field_shape={self.field_shape}"
+
+    @property
+    def _comes(self) -> str:
+        return f"{100 * self.share:.0f} % of the light comes from outside"
 
 
 def outside_light(
@@ -55,7 +63,7 @@ def outside_light(
     misfit, field = misfit_of(problem, image), problem.field_shape
     if misfit is None or max(misfit.smooth) < _SUSPECTED:
         return None
-    whole = tuple(map(max, model.seen_field, field))
+    whole = max(model.seen_field[0], field[0]), max(model.seen_field[1], field[1])
     try:
         wide = with_field(recording, whole).problem(
             tau=problem.tau, nonnegative=problem.nonnegative, synthesis=synthesis
@@ -68,19 +76,34 @@ def outside_light(
         (wide, start), size = smaller, 2 * size
     method = in_parallel(wide, functools.partial(admm_method, near=True))
     found = iterate(method, start, _SCHEDULE).image
-    before, after = (max(misfit_of(wide, one).smooth) for one in (start, found))  # type: ignore
-    global LAST; LAST = (misfit, before, after)
+    before, after = (misfit_of(wide, one) for one in (start, found))
+    if before is None or after is None or max(after.smooth) > _STAYS * max(before.smooth):
+        return None
     light = np.abs(np.asarray(found)).reshape(-1, *found.shape[-2:]).sum(axis=0)
     rows, columns = (
         slice((n - m) // 2, (n + m) // 2)
         for n, m in zip(light.shape, (-(-f // size) for f in field), strict=True)
     )
-    share = 1 - light[rows, columns].sum() / light.sum()
-    LAST = LAST + (share,)
-    if after > _STAYS * before or share < _COUNTS:
+    inside = light[rows, columns]
+    light[light < _BRIGHT * np.sum(inside**2) / max(inside.sum(), np.finfo(float).tiny)] = 0
+    share = float(1 - light[rows, columns].sum() / light.sum())
+    if share < _COUNTS:
         return None
-    held = (_held(light.sum(axis=1 - axis), size, field[axis], whole[axis]) for axis in (0, 1))
-    return OutsideLight(float(share), tuple(held))
+    height, width = (
+        _held(light.sum(axis=1 - axis), size, field[axis], whole[axis]) for axis in (0, 1)
+    )
+    return OutsideLight(share, same_parity((height, width), problem.captures[0].shape[-2:]))
+
+
+def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recording:
+    """A recording whose field, where none is given, holds the start image."""
+    model = recording.imaging_model
+    if start is None or not isinstance(model, Cameras) or model.pixels is not None:
+        return recording
+    sensor, given = model.cameras[0].sensor.shape, np.shape(start)[-2:]
+    if len(given) < 2 or all(n <= s for n, s in zip(given, sensor, strict=True)):
+        return recording
+    return with_field(recording, (max(given[0], sensor[0]), max(given[1], sensor[1])))
 
 
 def with_field(recording: Recording, shape: tuple[int, int]) -> Recording:
