@@ -64,8 +64,11 @@ class Cameras(Module):
     - `wavelength`: mm, one or one for each camera.
     - `object_distance`: t, mm, of the focus. Several give as many planes, each in its own
       projection: the same pixel of all planes lies on one ray through the mask.
-    - `field_shape`: pixels of the image, default those of the sensor; the scene is taken as black
-      outside. Its pixels are p·t/d apart on the object, d the largest distance.
+    - `field_shape`: pixels of the image, p·t/d apart on the object, d the largest distance; the
+      scene is taken as black outside. Default: those of the sensor; `AdmmTV` and `Fista` take more
+      where the captures show light beyond them (`outside_light`).
+    - `field_height`, `field_width`: in place of it, mm on the (nearest) object; the sensor's where
+      only one is given.
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`. With
       `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
       (`field_operator`), for solvers by iteration. Filters take the PSF of the axis, and divide the
@@ -103,6 +106,7 @@ class Cameras(Module):
     pixel_integration: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
 
     def __check_init__(self):
+        """Refuse a field in pixels and in mm."""
         if self.field_shape is not None and (self.field_height, self.field_width) != (None, None):
             raise ValueError(
                 f"field_shape = {self.field_shape} and field_height or field_width are given; "
