@@ -1,6 +1,7 @@
-"""Fields smaller than, of and larger than the scene: PSNR, CPU seconds, and what is said of them."""
+"""Fields of the scene, the sensor and all that it sees: PSNR, CPU seconds, and what is said."""
 
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,7 +28,7 @@ def camera(name, width):
     return tc.LenslessCamera(masks[name](), SENSOR, DISTANCE)
 
 
-def recorded(one, picture, size, snr, **field):
+def recorded(one, picture, size, snr, **field) -> tuple[tc.ImagePlane, Any]:
     plane = tc.ImagePlane(picture, FAR, size * ACROSS)
     noise = tc.GaussianNoise(snr_db=snr)
     capture = tc.capture(one, tc.Scene(plane, 550 * nm), key=0, noise=noise)
@@ -45,10 +46,10 @@ def decibels(result, plane, shape):
     return -10 * np.log10(np.mean((gain * image + offset - truth) ** 2) / truth.max() ** 2)
 
 
-def timed(call):
-    call()  # compiles
+def timed(call, *given):
+    call(*given)  # compiles
     began = time.process_time()
-    found = call()
+    found = call(*given)
     jax.block_until_ready(found)
     return found, time.process_time() - began
 
@@ -58,30 +59,32 @@ def test_fields(name, width):
     """The scene's own field, the sensor's, all that the sensor sees, and the one found."""
     one, picture = camera(name, width), resize(sample_image("camera"), (256, 320))
     for size in (0.6, 0.95, 1.3):
-        own = tuple(int(np.ceil(n * size)) for n in SENSOR.shape)
+        own: Any = tuple(int(np.ceil(n * size)) for n in SENSOR.shape)
         middle = tuple(min(n, m) for n, m in zip(own, SENSOR.shape, strict=True))
         plane, recording = recorded(one, picture, size, 30.0)
         whole, line = recording.imaging_model.seen_field, f"{name} {width} mm, scene {size}:"
         for label, field in (("own", own), ("sensor", SENSOR.shape), ("seen", whole)):
             given = with_field(recording, field)
-            result, seconds = timed(lambda given=given: tc.reconstruct(given, tc.AdmmTV()))
+            result, seconds = timed(tc.reconstruct, given, tc.AdmmTV())
             line += f" {label} {decibels(result, plane, middle):.1f} dB {seconds:.2f} s;"
-        result, seconds = timed(lambda: tc.reconstruct(recording, tc.AdmmTV()))
+        result, seconds = timed(tc.reconstruct, recording, tc.AdmmTV())
         problem, image = recording.problem(), recording.oriented(result.image)[None, None]
         fits = image.shape[-2:] == problem.field_shape
         line += f" default {decibels(result, plane, middle):.1f} dB {seconds:.2f} s"
         if fits:  # else the field has been found
-            _, check = timed(lambda: outside_light(recording, problem, image, None))
+            _, check = timed(outside_light, recording, problem, image, None)
             line += f", of it the check {check:.3f} s"
         print(line, result.image.shape, result.reason)
 
 
 def test_clean_captures():
-    """Scenes inside the field, or of its size, at 15 to 40 dB: none is said to come from outside."""
+    """Scenes inside the field, or of its size, at 15 to 40 dB: nothing is said."""
     random, said = np.random.default_rng(5), 0
     pictures = [resize(sample_image(n), (128, 160)) for n in ("camera", "coins", "text", "moon")]
     for number in range(40):
-        one = camera(("zones", "MURA", "random", "sparse")[number // 10], (1.2, 2.4)[number // 5 % 2])
+        one = camera(
+            ("zones", "MURA", "random", "sparse")[number // 10], (1.2, 2.4)[number // 5 % 2]
+        )
         size = 0.8 if number % 2 else random.uniform(0.3, 0.97)
         side = {"field_width": size * ACROSS, "field_height": 0.8 * size * ACROSS}
         picture, snr = pictures[number % 4], float(random.choice([15, 20, 30, 40]))

@@ -1,12 +1,15 @@
 """Light from outside of the field: found, named with the field that holds it, and taken in."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import thincam_jax as tc
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.reconstruction.outside_light import covering, outside_light, with_field
+from thincam_jax.reconstruction.depth import refocus_sweep
+from thincam_jax.reconstruction.outside_light import covering, outside_light, pinned, with_field
 from thincam_jax.units import nm, um
 
 SHAPE, PITCH, DISTANCE, FAR = (64, 76), 48 * um, 3.0, 250.0
@@ -27,7 +30,7 @@ def seen(size, snr=35.0, shading=0.0, **field):
     return plane, tc.Recording([capture], tc.Cameras([CAMERA], **LIGHT, **field))
 
 
-def likeness(result, plane, shape=None):
+def likeness(result: Any, plane, shape=None):
     """Correlation with the photograph, over the middle of a shape."""
     image = np.asarray(result.image)
     truth = np.asarray(plane.sample(tc.Grid(image.shape, result.pitch), magnification=1.0))
@@ -84,12 +87,22 @@ def test_the_choice_of_a_solver_keeps_what_was_noticed():
     assert "PlugAndPlay" in reason and "give field_shape=" in reason
 
 
+@pytest.mark.thorough
+def test_a_sweep_keeps_the_shape_of_its_images():
+    """At wrong distances light seems to come from elsewhere."""
+    _, recording = seen(1.25)
+    sweep = refocus_sweep(recording, [150.0, FAR, 500.0], tc.AdmmTV(1.0, iterations=100))
+    assert np.shape(sweep.images) == (3, *SHAPE)
+
+
 def test_other_models_and_starts_are_as_before():
     _, recording = seen(0.7)
     assert covering(recording, None) is covering(recording, jnp.ones(SHAPE)) is recording
-    larger = covering(recording, jnp.ones((3, 60, 90)))
+    larger: Any = covering(recording, jnp.ones((3, 60, 90)))
     assert larger.imaging_model.pixels == (64, 90)
     psf = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(np.ones((1, 3, 3))))
     problem = psf.problem()
     assert outside_light(psf, problem, jnp.zeros(problem.image_shape), None) is None
-    assert covering(psf, jnp.ones((60, 90))) is psf
+    assert covering(psf, jnp.ones((60, 90))) is psf is pinned(psf)
+    fixed: Any = pinned(recording)
+    assert fixed.imaging_model.pixels == SHAPE and pinned(larger) is larger

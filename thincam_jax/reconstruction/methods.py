@@ -233,8 +233,9 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
-        outside = None
-        if outcome.status == "converged" or outcome.iterations >= _SETTLED:
+        outside, ended = None, outcome.status
+        settled = ended == "iterations_exhausted" and outcome.iterations >= _SETTLED
+        if ended == "converged" or settled:
             outside = outside_light(recording, problem, outcome.image, self.synthesis)
         if outside is not None and recording.imaging_model.pixels is None:  # type: ignore
             wide = with_field(recording, outside.field_shape)

@@ -87,23 +87,31 @@ def outside_light(
     inside = light[rows, columns]
     light[light < _BRIGHT * np.sum(inside**2) / max(inside.sum(), np.finfo(float).tiny)] = 0
     share = float(1 - light[rows, columns].sum() / light.sum())
-    if share < _COUNTS:
+    if not share >= _COUNTS:  # NaN of a black image, too
         return None
     height, width = (
         _held(light.sum(axis=1 - axis), size, field[axis], whole[axis]) for axis in (0, 1)
     )
-    return OutsideLight(share, same_parity((height, width), problem.captures[0].shape[-2:]))
+    return OutsideLight(share, same_parity((height, width), model.cameras[0].sensor.shape))
 
 
 def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recording:
-    """A recording whose field, where none is given, holds the start image."""
+    """A recording whose field, where none is given, holds a start image larger than the sensor."""
     model = recording.imaging_model
-    if start is None or not isinstance(model, Cameras) or model.pixels is not None:
+    if start is None or start.ndim < 2 or not isinstance(model, Cameras):
         return recording
-    sensor, given = model.cameras[0].sensor.shape, np.shape(start)[-2:]
-    if len(given) < 2 or all(n <= s for n, s in zip(given, sensor, strict=True)):
+    (rows, columns), given = model.cameras[0].sensor.shape, start.shape[-2:]
+    if model.pixels is not None or (given[0] <= rows and given[1] <= columns):
         return recording
-    return with_field(recording, (max(given[0], sensor[0]), max(given[1], sensor[1])))
+    return with_field(recording, (max(given[0], rows), max(given[1], columns)))
+
+
+def pinned(recording: Recording) -> Recording:
+    """A recording whose field stays the sensor's where none is given, whatever is found outside."""
+    model = recording.imaging_model
+    if not isinstance(model, Cameras) or model.pixels is not None:
+        return recording
+    return with_field(recording, model.cameras[0].sensor.shape)
 
 
 def with_field(recording: Recording, shape: tuple[int, int]) -> Recording:
