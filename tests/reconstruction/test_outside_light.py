@@ -45,7 +45,7 @@ def likeness(result: Any, plane, shape=None):
 @pytest.mark.parametrize("solver", [tc.AdmmTV(), tc.Fista()])
 def test_a_scene_beyond_a_given_field_is_said_and_the_advice_gains(solver):
     plane, recording = seen(1.0, field_shape=(44, 52))
-    result = tc.reconstruct(recording, solver)
+    result: Any = tc.reconstruct(recording, solver)
     said = result.reason.partition("of the light comes from outside of the field: give ")
     share, named = float(said[0].split()[-2]), eval(said[2].partition("=")[2])
     whole, inside = plane.image, plane.sample(tc.Grid((44, 52), result.pitch), magnification=1.0)
