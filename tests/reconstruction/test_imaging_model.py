@@ -145,3 +145,55 @@ def test_over_the_field_refuses():
         planes.problem()
     with pytest.raises(ValueError, match="model"):
         wide_recording("separabel")
+
+
+CAMERA = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, width=1.2), tc.Sensor((24, 33), 0.05), 5.0)
+LIGHT = {"wavelength": 500 * nm, "object_distance": 250.0}
+
+
+def test_the_field_in_mm():
+    """Pixels are 2.5 mm apart on the object; a side alone leaves the sensor's for the other."""
+    both = tc.Cameras([CAMERA], field_height=50.0, field_width=101.0, **LIGHT)
+    assert both.pixels == (20, 41)
+    assert tc.Recording([np.ones((24, 33))], both).problem().field_shape == (20, 41)
+    assert tc.Cameras([CAMERA], field_width=50.0, **LIGHT).pixels == (24, 20)
+    planes = tc.Cameras(
+        [CAMERA], field_height=50.0, **(LIGHT | {"object_distance": [125.0, 250.0]})
+    )
+    assert planes.pixels == (40, 33)
+    assert tc.Cameras([CAMERA], **LIGHT).pixels is None
+    focused = tc.Recording([np.ones((24, 33))], both).focused(125.0)
+    assert focused.imaging_model.pixels == (40, 81)
+
+
+def test_the_field_that_the_sensor_sees():
+    """A shadow of 1.2 (1 + 5/250) mm is 24.5 pixels wide; nearer cameras are enlarged."""
+    assert tc.Cameras([CAMERA], **LIGHT).seen_field == (49, 58)
+    near = tc.LenslessCamera(CAMERA.mask, CAMERA.sensor, 2.5)
+    assert tc.Cameras([CAMERA, near], **LIGHT).seen_field == (97, 115)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"field_shape": (3, 4), "field_width": 9.0}, "are given; give pixels or mm"),
+        ({"field_width": -1.0}, "field_width = -1.0 mm is not positive"),
+        ({"field_height": 0.0}, "field_height = 0.0 mm is not positive"),
+    ],
+)
+def test_fields_that_are_refused(given, message):
+    with pytest.raises(ValueError, match=message) as error:
+        tc.Cameras([CAMERA], **given, **LIGHT)
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="no object_distance; give it in mm"):
+        _ = tc.Cameras([CAMERA], field_width=9.0).pixels
+
+
+def test_a_field_in_mm_needs_known_numbers():
+    def pixels_at(distance):
+        return tc.Cameras(
+            [CAMERA], wavelength=5e-4, object_distance=distance, field_width=9.0
+        ).pixels
+
+    with pytest.raises(TypeError, match="give field_shape, or known numbers"):
+        jax.jit(pixels_at)(250.0)

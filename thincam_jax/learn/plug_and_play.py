@@ -41,6 +41,7 @@ from thincam_jax.reconstruction.normal_equations import (
     normal_equations,
     padded_field,
 )
+from thincam_jax.reconstruction.outside_light import pinned
 from thincam_jax.reconstruction.parallel import independent_parts
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
@@ -232,7 +233,7 @@ class PlugAndPlay(AbstractIterativeSolver):
             start = recording.oriented(jnp.stack(found).reshape(problem.image_shape))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
-            begun = first.solve(recording, start=start)
+            begun = first.solve(pinned(recording), start=start)
         image = first_image(problem, recording.oriented(begun.image), uniform=True)
         for run, own in zip(runs, _split(image, [run.problem for run in runs]), strict=True):
             run.begin(own, "fitted")

@@ -55,7 +55,7 @@ class FringeFilter(eqx.Module):
         (beta, weights), camera = _check_phases(cameras.cameras), cameras.cameras[0]
         sensor = camera.sensor.grid
         self.sensor_shape = sensor.shape
-        self.field_shape = same_parity(cameras.field_shape or sensor.shape, sensor.shape)
+        self.field_shape = same_parity(cameras.pixels or sensor.shape, sensor.shape)
         sizes = zip(sensor.shape, self.field_shape, strict=True)
         rows, columns = (s + max(s, f) for s, f in sizes)
         padded = fast_shape((rows, columns))

@@ -1,5 +1,6 @@
 """Imaging models: cameras whose PSFs are computed, or PSFs that were measured."""
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +15,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import unchecked
+from thincam_jax._core.quantity import quantity, unchecked
 from thincam_jax.imaging.operators import LowRank, Resampled, kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import field_fit, tangents_of
@@ -27,6 +28,13 @@ _DARK = 0.3  # share of a PSF's absolute sum
 
 def _field_shape(given: Any) -> tuple[int, int] | None:
     return None if given is None else checks.shape2d("field_shape", given)
+
+
+def _side(name: str, given: Any) -> float:
+    return float(checks.positive(name, given, "mm"))
+
+
+_SIDE = functools.partial(quantity, "mm", optional=True, check=_side)
 
 
 def _cameras(given: Sequence[LenslessCamera]) -> tuple[LenslessCamera, ...]:
@@ -56,8 +64,11 @@ class Cameras(Module):
     - `wavelength`: mm, one or one for each camera.
     - `object_distance`: t, mm, of the focus. Several give as many planes, each in its own
       projection: the same pixel of all planes lies on one ray through the mask.
-    - `field_shape`: pixels of the image, default those of the sensor; the scene is taken as black
-      outside. Its pixels are p·t/d apart on the object, d the largest distance.
+    - `field_shape`: pixels of the image, p·t/d apart on the object, d the largest distance; the
+      scene is taken as black outside. Default: those of the sensor; `AdmmTV` and `Fista` take more
+      where the captures show light beyond them (`outside_light`).
+    - `field_height`, `field_width`: in place of it, mm on the (nearest) object; the sensor's where
+      only one is given.
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`. With
       `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
       (`field_operator`), for solvers by iteration. Filters take the PSF of the axis, and divide the
@@ -83,15 +94,63 @@ class Cameras(Module):
     field_shape: tuple[int, int] | None = eqx.field(
         default=None, converter=_field_shape, static=True, kw_only=True
     )
+    field_height: float | None = eqx.field(
+        default=None, converter=_SIDE(), static=True, kw_only=True
+    )
+    field_width: float | None = eqx.field(
+        default=None, converter=_SIDE(), static=True, kw_only=True
+    )
     model: Model | PsfMethod = eqx.field(
         default="separable", converter=_model, static=True, kw_only=True
     )
     pixel_integration: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
 
+    def __check_init__(self):
+        """Refuse a field in pixels and in mm."""
+        if self.field_shape is not None and (self.field_height, self.field_width) != (None, None):
+            raise ValueError(
+                f"field_shape = {self.field_shape} and field_height or field_width are given; "
+                "give pixels or mm"
+            )
+
     @property
     def count(self) -> int:
         """Number of captures."""
         return len(self.cameras)
+
+    @property
+    def pixels(self) -> tuple[int, int] | None:
+        """Pixels of the field given, of the nearest plane if in mm; None for the default."""
+        sides = self.field_height, self.field_width
+        if sides == (None, None):
+            return self.field_shape
+        pitch, sensor = self._projected(float(self._furthest.distance)), self._furthest.sensor.shape
+        rows, columns = (
+            n if side is None else max(1, math.ceil(side / pitch - 1e-3))
+            for n, side in zip(sensor, sides, strict=True)
+        )
+        return rows, columns
+
+    @property
+    def seen_field(self) -> tuple[int, int]:
+        """Pixels of the field whose points cast a part of a mask's shadow on its sensor."""
+        sizes = []
+        for camera, ratio in zip(self.cameras, distance_ratios(self.cameras), strict=True):
+            pitch, distance = float(camera.sensor.pitch), float(camera.distance)
+            spread = 1 + pitch / self._projected(distance)
+            mask = np.asarray(camera.mask.extent) + 2 * np.abs(np.asarray(camera.mask.centre))
+            sizes.append(ratio * (np.array(camera.sensor.shape) + spread * mask / pitch))
+        rows, columns = np.ceil(np.max(sizes, axis=0)).astype(int)
+        return int(rows), int(columns)
+
+    def _projected(self, distance: float) -> float:
+        """Distance of the pixels of a camera at `distance` on the nearest object, mm."""
+        self.require("object_distance")
+        if checks.holds_traced(self.object_distance, self.cameras):
+            raise TypeError(
+                "field_height and field_width set array sizes: give field_shape, or known numbers"
+            )
+        return float(self._furthest.sensor.pitch) * float(np.min(self.object_distance)) / distance
 
     @property
     def pitch(self) -> Float[Array, "*plane"]:

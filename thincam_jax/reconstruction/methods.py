@@ -21,6 +21,7 @@ from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
 from thincam_jax.reconstruction.other_psf import better_psf
+from thincam_jax.reconstruction.outside_light import covering, outside_light, with_field
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -61,6 +62,8 @@ _BALANCED = 30
 _COARSER, _ROUGH = 2, 3e-3
 # Share of the iterations that a biased camera spends without its uniform light.
 _FIRST_PART = 0.4
+# Iterations after which an image that has not converged tells of light from outside as well.
+_SETTLED = 100
 
 
 @checked
@@ -120,7 +123,12 @@ def reconstruct(
         raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:
         result = solver.solve(recording)
-    return dataclasses.replace(result, reason=reason) if reason else result
+    return _saying(result, reason, result.reason)
+
+
+def _saying(result: Reconstruction, *reasons: str) -> Reconstruction:
+    said = "; ".join(filter(None, reasons))
+    return dataclasses.replace(result, reason=said) if said else result
 
 
 @checked
@@ -198,6 +206,7 @@ class AbstractRegularised(AbstractIterativeSolver):
         dark field is nearer to zero.
         """
         rule, reason = (self.tau if isinstance(self.tau, str) else None), ""
+        recording = covering(recording, start)
         problem = recording.problem(
             tau=DEFAULT_TAU if rule else self.tau,
             regulariser=self.prior,
@@ -225,13 +234,20 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
+        outside, ended = None, outcome.status
+        settled = ended == "iterations_exhausted" and outcome.iterations >= _SETTLED
+        if ended == "converged" or settled:
+            outside = outside_light(recording, problem, outcome.image, self.synthesis)
+        if outside is not None and recording.imaging_model.pixels is None:  # type: ignore
+            wide = with_field(recording, outside.field_shape)
+            again = self.solve(wide, start=start, callback=callback)
+            return _saying(again, outside.taken, again.reason)
         if unit is not None:
             outcome = dataclasses.replace(outcome, image=outcome.image / unit)
         if rule:
             outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
         result = recording.reconstruction(outcome, self.name, float(problem.tau))
-        said = "; ".join(filter(None, (reason, outcome.reason)))
-        return dataclasses.replace(result, reason=said) if said else result
+        return _saying(result, reason, outcome.reason, str(outside or ""))
 
 
 class AdmmTV(AbstractRegularised):

@@ -376,7 +376,7 @@ class Recording(Module):
         model, sensor = self.imaging_model, self.captures[0].shape[-2:]
         if isinstance(model, Cameras):
             grid = model.cameras[0].sensor.grid
-            return same_parity(model.field_shape or grid.shape, grid.shape)
+            return same_parity(model.pixels or grid.shape, grid.shape)
         kernel = model.psfs.shape[-2:]  # type: ignore[union-attr]
         whole = tuple(s + k - 1 for s, k in zip(sensor, kernel, strict=True))
         return _fitting_field(model.field_shape or whole, sensor, kernel)  # type: ignore

@@ -109,7 +109,7 @@ class WienerSynthesis(eqx.Module):
         matrix = synthesis_matrix(synthesis, each, capture_ratios)
         sensor = each[0].sensor.grid
         self.sensor_shape = sensor.shape
-        self.field_shape = same_parity(cameras.field_shape or sensor.shape, sensor.shape)
+        self.field_shape = same_parity(cameras.pixels or sensor.shape, sensor.shape)
         self.ratios = tuple(
             next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in matrix
         )

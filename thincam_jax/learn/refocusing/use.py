@@ -119,9 +119,9 @@ class Learned(AbstractSolver):
         network = load(SHIPPED, model) if self.network is None else self.network
         camera = network.camera
         same_camera("the network", described(camera), model)
-        if model.field_shape not in (None, camera.field_shape):
+        if model.pixels not in (None, camera.field_shape):
             raise ValueError(
-                f"field_shape is {model.field_shape} and the network's {camera.field_shape}; "
+                f"field_shape is {model.pixels} and the network's {camera.field_shape}; "
                 "leave it out"
             )
         if recording.valid is not None and not all(np.asarray(m).all() for m in recording.valid):

@@ -16,6 +16,7 @@ from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.methods import choose_solver, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
+from thincam_jax.reconstruction.outside_light import pinned
 from thincam_jax.reconstruction.poisson import PoissonTV
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.solver import AbstractSolver
@@ -85,7 +86,7 @@ def refocus_sweep(
         )
     if recording.noise_variance is None and not isinstance(solver, PoissonTV):
         recording = recording.with_noise(estimate_variance(recording.captures))
-    focused = _focused(recording, focus)
+    focused = [pinned(one) for one in _focused(recording, focus)]
     if solver is None:
         solver, _ = choose_solver(focused[0])
     images, slope = [], None
