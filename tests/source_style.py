@@ -220,15 +220,6 @@ _DANGLING = r"(?:Of|As|By|With|Without|From|In|At(?! most)|For|Over|On|Before|Wh
 _BEGINNING = re.compile(rf"{_DANGLING}|The same\b")
 _ITEM = re.compile(r"(?:^|[-;.] )(`[^`]+`(?:, `[^`]+`)*(?: \([^)]*\))?: (?:of|as|the same|what))\b")
 # Complaints that files still have: lower a number with each that is mended.
-DANGLING_LEFT = {
-    "commands/reconstruct/options.py": 3,
-    "commands/reconstruct/run.py": 4,
-    "measured/dark.py": 1,
-    "measured/exposures.py": 1,
-    "measured/preparation.py": 2,
-    "reconstruction/imaging_model.py": 2,
-    "reconstruction/recording.py": 1,
-}
 
 
 def docstrings(module: Module) -> Iterator[tuple[int, str]]:
@@ -254,7 +245,7 @@ def dangling(module: Module) -> list[str]:
 def dangling_prose(modules: list[Module]) -> list[str]:
     """A docstring and each item in it begin with a noun, with a unit where it has one."""
     found = {module.path: dangling(module) for module in modules}
-    return [text for path in found for text in found[path][DANGLING_LEFT.get(path, 0) :]]
+    return [text for texts in found.values() for text in texts]
 
 
 STYLE_RULES = (

@@ -99,7 +99,7 @@ def without_hot_pixels(raw: Raw, dark: Raw) -> tuple[Raw, Raw]:
 
 
 def _corners(shape: tuple[int, ...], corner: tuple[int, int]) -> list[tuple[slice, slice]]:
-    """The same square from each corner."""
+    """A square at the same distance from each corner."""
     start, stop = corner
     rows, columns = ((slice(start, stop), slice(n - stop, n - start)) for n in shape[-2:])
     return [(row, column) for row in rows for column in columns]

@@ -60,7 +60,7 @@ class ExposedFrames:
 class MergedExposures:
     """Result of `merge_exposures`.
 
-    - `rate`, `variance`: of each pixel, counts/s and (counts/s)². The variance is infinite where
+    - `rate`, `variance`: a pixel's signal and its variance, counts/s and (counts/s)². The variance is infinite where
       every exposure is saturated; the rate is then that of a full pixel, a lower bound.
     - `gain`: g, counts per electron. `dark_variance`: s² of each exposure, counts².
     """

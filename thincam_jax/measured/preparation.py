@@ -29,8 +29,8 @@ class Prepared:
       so may have more pixels than the capture.
     - `capture`: in fractions of full scale divided by `log.capture_divisor`.
     - `valid`: False where the capture is saturated or dead.
-    - `log`: what the steps did.
-    - `variance`: of the capture, by a sensor's calibration, for independent values before
+    - `log`: numbers of the steps.
+    - `variance`: the capture's, by a sensor's calibration, for independent values before
       `downsample`; infinite where not valid.
     """
 

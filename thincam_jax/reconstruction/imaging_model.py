@@ -69,7 +69,7 @@ class Cameras(Module):
       where the captures show light beyond them (`outside_light`).
     - `field_height`, `field_width`: in place of it, mm on the (nearest) object; the sensor's where
       only one is given.
-    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`. With
+    - `model`, `pixel_integration`: how PSFs are computed, see `thincam_jax.psf`. With
       `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
       (`field_operator`), for solvers by iteration. Filters take the PSF of the axis, and divide the
       image by the light.
@@ -185,7 +185,7 @@ class Cameras(Module):
         return isinstance(self.model, PsfMethod) and self.model.field_tolerance is not None
 
     def light(self, field: tuple[int, int]) -> Float[Array, "m n"]:
-        """Of the points of a field, 1 on the axis; without a `field_tolerance` one 1 for all."""
+        """Light of the points of a field, 1 on the axis; without a `field_tolerance` one 1 for all."""
         if not self.over_field:
             return jnp.ones((1, 1))
         sensor, tangents = self._furthest.sensor, tangents_of(self._furthest, field)

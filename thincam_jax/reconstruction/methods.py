@@ -247,7 +247,7 @@ class AbstractRegularised(AbstractIterativeSolver):
         if rule:
             outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
         result = recording.reconstruction(outcome, self.name, float(problem.tau))
-        return _saying(result, reason, outcome.reason, str(outside or ""))
+        return _saying(result, reason, str(outside or outcome.reason))
 
 
 class AdmmTV(AbstractRegularised):

@@ -279,7 +279,7 @@ class Recording(Module):
         return len(detector_shape(model.operators[0])) if isinstance(model, Stacked) else 2
 
     def _operators(self) -> tuple[AbstractOperator, ...]:
-        """Those of a model that is no PSF for the whole field."""
+        """Operators of a model that is no PSF for the whole field."""
         model = self.imaging_model
         if isinstance(model, Cameras):
             return model.field_operators(self._field()) if model.over_field else ()

@@ -31,7 +31,8 @@ class Job:
       image that is sharp everywhere.
     - `label`: that distance, for messages.
     - `beside`: further files.
-    - `others`: further exposures of the capture. `backgrounds`: of each, where they differ.
+    - `others`: further exposures of the capture. `backgrounds`: the exposures', where
+      they differ.
     """
 
     capture: Path
@@ -118,7 +119,7 @@ class Rig:
     def _read(
         self, files: Sequence[Path], dark: Sequence[Path], bits: int | None, is_psf: bool = False
     ) -> tuple[measured.Raw, Level | None]:
-        """One image, merged of its exposures, and its background; `dark`: of each file."""
+        """One image, merged of its exposures, and its background; `dark`: each file's."""
         n, given = len(files), self.sources.exposures if len(files) > 1 else ()
         times = (given[:n] if is_psf else given[-n:]) or (None,) * n
         images = [self._image(*one, bits) for one in zip(files, times, strict=True)]

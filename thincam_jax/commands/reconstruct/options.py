@@ -86,11 +86,11 @@ class Recipe:
     - `method`: one of `PSF_METHODS`.
     - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most;
       None: as many as the method has by default.
-    - `coupling`: of colours; None: "joint" for several channels.
+    - `coupling`: how colours share edges; None: "joint" for several channels.
     - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
       light to it.
     - `flip`: turn the image by 180°.
-    - `ridge`: of the method "ridge", which has neither tau nor coupling; None: 1.
+    - `ridge`: strength of the method "ridge", which has neither tau nor coupling; None: 1.
     - `noise`: standard deviation of a raw pixel's noise, counts; None: estimated.
     - `focusing`: a network; `method` is then "learned", and nothing else of it is used.
     - `strict`: severe findings of the examination are errors.
@@ -187,7 +187,7 @@ class Output:
 
     - `path`: an image file; or a folder, in which each result has the name of its capture.
     - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
-    - `gamma`, `white_balance`: of the PNG; see `measured.to_display`.
+    - `gamma`, `white_balance`: encoding of the PNG; see `measured.to_display`.
     - `unsure`: also NAME-unsure.png, a learned image with what is not sure in red.
     """
 

@@ -47,11 +47,11 @@ Report = Callable[[str, Progress], None]
 class Finished:
     """A capture whose image (channel, y, x) was written, and the record beside it.
 
-    - `line`: what was done, in a line. `doubt`: what is wrong with an image that does not explain
+    - `line`: a line that says what was done. `doubt`: fault with an image that does not explain
       its capture, or nothing.
     - `status`: see `Reconstruction.ending`.
     - `marked`: the image with its uncertain pixels marked, as a PNG.
-    - `findings`: of the image's residual and noise.
+    - `findings`: faults that residual and noise show.
     """
 
     job: Job
@@ -259,7 +259,7 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
 
 
 def _focus(job: Job, ready: measured.Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
-    """The same by a network."""
+    """The image of a network; its record is of the method alone."""
     from thincam_jax.learn.refocusing.use import SURE, doubt, read
     from thincam_jax.plot.frame import as_png
     from thincam_jax.plot.learned import draw_unsure
