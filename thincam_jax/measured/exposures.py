@@ -60,8 +60,8 @@ class ExposedFrames:
 class MergedExposures:
     """Result of `merge_exposures`.
 
-    - `rate`, `variance`: a pixel's signal and its variance, counts/s and (counts/s)². The variance is infinite where
-      every exposure is saturated; the rate is then that of a full pixel, a lower bound.
+    - `rate`, `variance`: a pixel's signal and its variance, counts/s and (counts/s)². The variance
+      is infinite where every exposure is saturated; the rate is then a lower bound, a full pixel's.
     - `gain`: g, counts per electron. `dark_variance`: s² of each exposure, counts².
     """
 

@@ -185,7 +185,7 @@ class Cameras(Module):
         return isinstance(self.model, PsfMethod) and self.model.field_tolerance is not None
 
     def light(self, field: tuple[int, int]) -> Float[Array, "m n"]:
-        """Light of the points of a field, 1 on the axis; without a `field_tolerance` one 1 for all."""
+        """Light of a field's points, 1 on the axis; one 1 for all without a `field_tolerance`."""
         if not self.over_field:
             return jnp.ones((1, 1))
         sensor, tangents = self._furthest.sensor, tangents_of(self._furthest, field)
