@@ -63,7 +63,7 @@ def test_shading_counts_less():
     """What the high-passed problem keeps of it is as weak as the rule says."""
     problem, image = problem_of(error=0.3, sigma=0.01, claimed=0.01)
     found = misfit_of(problem, image)
-    assert found.smooth[0] > 20 and "smooth light counts less" in str(found)
+    assert found.smooth[0] > 20 and "smooth part is" in str(found)
     easier = found.less_smooth(problem)
     after = misfit_of(easier, image)
     assert after.smooth[0] < found.smooth[0] / 3

@@ -24,9 +24,9 @@ from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.smooth_misfit import misfit_of
 from thincam_jax.reconstruction.splittings import admm_method
 
-# Smooth residual over that of the noise from which on light may come from outside, and the most of
-# it that stays if it does.
-_SUSPECTED, _STAYS = 1.5, 0.7
+# Smooth residual over that of the noise from which on light may come from outside, the most of it
+# that stays if it does, and the most after that: 0.8 to 4.2, of 10 % of shading 13 to 33.
+_SUSPECTED, _STAYS, _LEFT = 1.5, 0.7, 8.0
 # Part of the field's brightness that is an object, not haze that explains shading; the least share
 # of the light that counts, and the share that may stay outside of the field named.
 _BRIGHT, _COUNTS, _BEYOND = 0.2, 0.05, 0.01
@@ -77,7 +77,9 @@ def outside_light(
     method = in_parallel(wide, functools.partial(admm_method, near=True))
     found = iterate(method, start, _SCHEDULE).image
     before, after = (misfit_of(wide, one) for one in (start, found))
-    if before is None or after is None or max(after.smooth) > _STAYS * max(before.smooth):
+    if before is None or after is None:
+        return None
+    if max(after.smooth) > min(_LEFT, _STAYS * max(before.smooth)):
         return None
     light = np.abs(np.asarray(found)).reshape(-1, *found.shape[-2:]).sum(axis=0)
     rows, columns = (

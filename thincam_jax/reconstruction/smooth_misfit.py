@@ -45,7 +45,7 @@ class Misfit:
         if self.is_smooth:
             return (
                 f"the residual's smooth part is {worst:.0f} times that of the noise (shading, "
-                "stray light or a scene beyond the field), so smooth light counts less"
+                "stray light or a scene beyond the field)"
             )
         if self.whole > _TOLD:
             return (
@@ -61,6 +61,7 @@ class Misfit:
 
     @property
     def is_smooth(self) -> bool:
+        """Whether most of what is left is smooth."""
         return max(self.smooth) > max(_MISFIT, _SMOOTH * self.whole)
 
     def less_smooth(self, problem: InverseProblem) -> InverseProblem | None:
