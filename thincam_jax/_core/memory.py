@@ -1,6 +1,7 @@
 """Memory that an evaluation needs, estimated before it starts."""
 
 import os
+import sys
 from pathlib import Path
 
 
@@ -25,6 +26,16 @@ def available_bytes() -> int | None:
     if "bytes_limit" not in statistics:
         return None
     return statistics["bytes_limit"] - statistics.get("bytes_in_use", 0)
+
+
+def peak_memory() -> float | None:
+    """Largest memory that this process held, GB to 10 MB; None where the system does not say."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2)
 
 
 def refuse_if_too_large(what: str, needed: int, advice: str) -> None:

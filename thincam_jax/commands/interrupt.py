@@ -1,5 +1,6 @@
 """Ctrl-C: it ends the command in one line, and reaches work that has something to keep."""
 
+import _thread
 import contextlib
 import os
 import signal
@@ -43,5 +44,8 @@ def _again(lost: "sys.UnraisableHookArgs") -> None:
     import threading
 
     # To the main thread, which may be waiting in the system.
-    again = signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)
+    if hasattr(signal, "pthread_kill"):
+        again = signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)
+    else:  # Windows
+        again = _thread.interrupt_main, ()
     threading.Timer(0.05, *again).start()

@@ -8,7 +8,6 @@ penalties.
 
 import contextlib
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -17,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from thincam_jax._core.environment import usable_cores
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.reconstruction.iterate import AbstractMethod, Residuals
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions
@@ -154,7 +154,7 @@ def _in_threads(function: Callable, *sequences) -> list:
                     stack.enter_context(_SETTINGS[name](value))
             return function(*arguments)
 
-    with ThreadPoolExecutor(min(len(sequences[0]), _cores())) as pool:
+    with ThreadPoolExecutor(min(len(sequences[0]), usable_cores())) as pool:
         return list(pool.map(run, *sequences))
 
 
@@ -171,10 +171,3 @@ _SETTINGS = {
 def _settings_of_thread() -> dict[str, Any]:
     values = {name: getattr(jax.config, name) for name in _SETTINGS}
     return {name: getattr(value, "value", value) for name, value in values.items()}
-
-
-def _cores() -> int:
-    """Number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

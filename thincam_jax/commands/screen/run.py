@@ -1,7 +1,5 @@
 """Screen experiments: from the file to the study, its run with a calibration, and its page."""
 
-import resource
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax import waveguide as wg
+from thincam_jax._core.memory import peak_memory
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.report import Content, Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
@@ -115,14 +114,13 @@ class _ScreenRun(Run):
 
     def report(self) -> None:
         study, found = self.study, dict(self.models.result.models)
-        rays, peak = study.rays(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        rays, memory = study.rays(), peak_memory()
         calibrated = None
         if self.calibration is not None:
             calibrated = self.calibration.result
             found[MEASURED] = ModelResult("by Hadamard patterns, with noise", calibrated.methods)
         result = self.result = ScreenResult(study, found)
         summary = summarise_rays(study, rays)
-        memory = round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2)
         kind = {"study": study.name, "kind": self.config.kind, "seed": study.seed}
         self.metrics = kind | screen_metrics(result, summary) | {"peak_memory_gb": memory}
         drawn = plot.draw_result(result, rays)
