@@ -229,7 +229,7 @@ def _reconstruct(
 
 
 def _left(ready: measured.Prepared, done: PreparedResult) -> tuple[float, float]:
-    """What is left of a capture, in parts of its variation, and the least that is not noise."""
+    """Residual of a capture in parts of its variation, and the least that is not noise."""
     light = ready.capture[ready.valid].astype(float)
     varies = max(float(light.std()), 1e-30)
     left = done.relative_residual * float(np.sqrt(np.mean(light**2))) / varies
