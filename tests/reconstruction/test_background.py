@@ -158,11 +158,11 @@ def test_gradients_pass_through_the_background():
 
 def test_the_same_background_is_sought_under_jit():
     """Captures that are known stay so, and may show that something was subtracted before."""
-    captures = np.random.default_rng(0).normal(0.1, 1, (1, 24, 30))
+    captures = jnp.asarray(np.random.default_rng(0).normal(0.1, 1, (1, 24, 30)))
     kinds = []
 
     def seek(psfs):
-        kinds.append(tc.Recording(jnp.asarray(captures), tc.Psfs(psfs)).problem().background)
+        kinds.append(tc.Recording(captures, tc.Psfs(psfs)).problem().background)
         return psfs
 
     psfs = jnp.ones((1, 5, 7))
