@@ -154,3 +154,18 @@ def test_gradients_pass_through_the_background():
     slope, one = jax.grad(projected)(0.0), jnp.asarray(1.0)
     expected = finite_difference(projected, 0 * one, one, 1e-4)
     np.testing.assert_allclose(slope, expected, rtol=1e-3)
+
+
+def test_the_same_background_is_sought_under_jit():
+    """Captures that are known stay so, and may show that something was subtracted before."""
+    captures = jnp.asarray(np.random.default_rng(0).normal(0.1, 1, (1, 24, 30)))
+    kinds = []
+
+    def seek(psfs):
+        kinds.append(tc.Recording(captures, tc.Psfs(psfs)).problem().background)
+        return psfs
+
+    psfs = jnp.ones((1, 5, 7))
+    seek(psfs)
+    jax.jit(seek)(psfs)
+    assert kinds == ["unknown", "unknown"]

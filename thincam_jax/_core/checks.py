@@ -55,6 +55,14 @@ def holds_traced(*values: Any) -> bool:
     return not holds_itself(values) and any(map(is_traced, jax.tree.leaves(values)))
 
 
+def staying_known(function: Callable[..., Any], *values: Any) -> Any:
+    """A function's result, which under jit is known, too, where the values are."""
+    if holds_traced(values):
+        return function(*values)
+    with jax.ensure_compile_time_eval():
+        return function(*values)
+
+
 def holds_itself(value: Any) -> bool:
     """Whether a list is inside itself."""
     try:

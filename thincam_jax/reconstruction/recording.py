@@ -125,7 +125,7 @@ class Recording(Module):
         self.imaging_model = imaging_model
         if not isinstance(captures, list | tuple) and np.ndim(captures) == 0:
             raise TypeError(f"captures is {checks.shown(captures)}; give an array for each camera")
-        pairs = [without_unknown(capture) for capture in captures]
+        pairs = [without_unknown(one) for one in checks.staying_known(list, captures)]
         self.captures, known = tuple(as_real(c) for c, _ in pairs), [one for _, one in pairs]
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
@@ -343,7 +343,8 @@ class Recording(Module):
         if self.valid is None:
             return list(self.light), [None] * len(self.captures)
         pairs = list(zip(self.light, self.valid, strict=True))
-        return [_without_invalid(c, m) for c, m in pairs], [m for _, m in pairs]
+        light = [checks.staying_known(_without_invalid, *pair) for pair in pairs]
+        return light, [m for _, m in pairs]
 
     def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
         """Variances of sums of captures: as given, or estimated where none or zero is given."""

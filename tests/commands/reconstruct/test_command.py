@@ -153,7 +153,7 @@ def test_ridge(grey, tmp_path):
     done = record_of(out)["reconstruction"]
     assert (done["method"], done["ridge"], done["nonnegative"]) == ("ridge", 0.5, False)
     assert done["tau"] is done["absolute_tau"] is done["variation"] is None
-    assert 0 < done["iterations"] <= 100 and done["relative_data_residual"] < 0.05
+    assert 0 < done["iterations"] <= 1000 and done["relative_data_residual"] < 0.05
 
 
 @pytest.mark.thorough

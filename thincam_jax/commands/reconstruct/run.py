@@ -211,7 +211,8 @@ def _reconstruct(
     if found.status == "interrupted" and not found.iterations:
         raise KeyboardInterrupt
     residual, doubt = done.relative_residual, ""
-    if not residual < _UNEXPLAINED:  # or no number
+    left, least = _left(ready, done)
+    if not residual < _UNEXPLAINED or left > max(_UNEXPLAINED, least):  # or no number
         why = (
             f"{name} = {value:g} is too large, give about 1" if value else "the PSF may be another"
         )
@@ -227,15 +228,20 @@ def _reconstruct(
     return Finished(job, facts, image, line, doubt, *ending)
 
 
-def _doubts(job: Job, ready: measured.Prepared, done: PreparedResult) -> Iterator[Finding]:
-    """A residual far above the noise, and a given noise that is not the one found."""
-    where, light = f"capture {job.capture}", ready.capture[ready.valid].astype(float)
+def _left(ready: measured.Prepared, done: PreparedResult) -> tuple[float, float]:
+    """Residual of a capture in parts of its variation, and the least that is not noise."""
+    light = ready.capture[ready.valid].astype(float)
     varies = max(float(light.std()), 1e-30)
     left = done.relative_residual * float(np.sqrt(np.mean(light**2))) / varies
+    return left, 3 * done.pixel_deviation / varies
+
+
+def _doubts(job: Job, ready: measured.Prepared, done: PreparedResult) -> Iterator[Finding]:
+    """A residual far above the noise, and a given noise that is not the one found."""
+    where, (left, least) = f"capture {job.capture}", _left(ready, done)
     if why := done.found.reason:
-        over = left * varies / done.pixel_deviation
-        yield finding("misfit", where, over, why.endswith((TURN, RESIZE)), why)
-    if left > max(_SUSPECT, 3 * done.pixel_deviation / varies):
+        yield finding("misfit", where, 3 * left / least, why.endswith((TURN, RESIZE)), why)
+    if left > max(_SUSPECT, least):
         yield finding("unexplained", where, 100 * left, True)
     given, found = done.noise.counts, pixel_noise(ready).counts
     if done.noise.found == "given" and not given / 3 <= found <= 3 * given:
