@@ -126,7 +126,7 @@ def test_accuracy_page(capsys):
 
 @pytest.mark.thorough
 def test_real_captures_page(tmp_path, monkeypatch, capsys):
-    """The image is the scene, and the gradient is the slope of what it is said to be."""
+    """The image is the scene, and what was done stands in its log."""
     monkeypatch.chdir(tmp_path)
     simulated.bayer_files(tmp_path)
     with jax.enable_x64(False):  # the precision of a user
@@ -134,7 +134,7 @@ def test_real_captures_page(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "(3, 30, 38)" in printed
     assert "nan" not in printed
-    ready, image = names["ready"], np.asarray(names["result"].image)
+    ready, image = names["ready"], names["result"].image()
     assert ready.log.capture.background == "dark frame dark.tif"
     truth = simulated.scene().reshape(3, 30, 2, 38, 2).mean(axis=(2, 4))
     for channel, expected in zip(image, truth, strict=True):
@@ -144,6 +144,13 @@ def test_real_captures_page(tmp_path, monkeypatch, capsys):
     assert json.loads((tmp_path / "result.json").read_text("utf-8")) == json.loads(
         names["measured"].log_text(ready.log)
     )
+
+
+@pytest.mark.thorough
+def test_design_in_python_page():
+    """The gradient through a reconstruction is the slope of what it is said to be."""
+    with jax.enable_x64(False):  # the precision of a user
+        names = run_examples("docs/guide/design_python.md")
     assert bool(jnp.isfinite(names["by_psf"]).all())
     for name in ("photo", "chart"):  # differences are taken in double precision
         names[name] = jnp.asarray(names[name], dtype=jnp.float64)
@@ -302,7 +309,7 @@ def test_links_to_headings_find_them():
 
 
 TESTED = ("start", "guide/accuracy", "guide/real_captures", "guide/flatcam", "guide/screen")
-TESTED += ("guide/screen_calibration",)
+TESTED += ("guide/screen_calibration", "guide/design_python")
 
 
 @pytest.mark.thorough
