@@ -24,8 +24,12 @@ from matplotlib import pyplot
 import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.imaging import metrics, operators, targets
+from thincam_jax.imaging.metrics.mtf import zero_crossings
 from thincam_jax.measured import calibration
 from thincam_jax.reconstruction import depth
+from thincam_jax.reconstruction.depth.find import depth_of_colours
+from thincam_jax.reconstruction.depth.focus import focus_measure
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 
 
 def drawn(function: Callable[..., Any], **given: Any) -> Call:
@@ -50,7 +54,7 @@ def streamed(captures: Any) -> Any:
 
 
 THREE = np.array([100.0, 200.0, 300.0])
-SWEEP = depth.RefocusSweep(RANDOM.random((3, 9, 12)), THREE, np.float64(0.01))
+SWEEP = RefocusSweep(RANDOM.random((3, 9, 12)), THREE, np.float64(0.01))
 DEPTHS = (
     call(depth.refocus_distances, nearest=100.0, farthest=300.0, count=3),
     call(depth.axial_resolution, camera=camera(), object_distance=250.0),
@@ -66,7 +70,7 @@ DEPTHS = (
         solver=call(tc.Ridge, ridge=1e-2),
     ),
     call(
-        depth.focus_measure,
+        focus_measure,
         image=IMAGE,
         measure="gradient_energy",
         smoothing=1.0,
@@ -88,7 +92,7 @@ DEPTHS = (
         depth=call(depth.depth_map, sweep=SWEEP, smoothing=1.0, window=2.0),
         smoothing=2.0,
     ),
-    call(depth.depth_of_colours, images=RANDOM.random((3, 2, 9, 12)), distances=[100.0, 200, 300]),
+    call(depth_of_colours, images=RANDOM.random((3, 2, 9, 12)), distances=[100.0, 200, 300]),
 )
 CHART, ELEMENTS = targets.usaf1951((64, 80), layers=1), targets.usaf1951_elements(layers=1)
 CURVE = {"frequency": np.linspace(0, 5, 60), "response": np.cos(np.linspace(0, 5, 60))}
@@ -117,7 +121,7 @@ PICTURES = (
     ),
     call(metrics.low_frequency_value, **CURVE),
     call(metrics.cut_off, **CURVE, part=0.05),
-    call(metrics.zero_crossings, **CURVE),
+    call(zero_crossings, **CURVE),
     call(metrics.first_common_zero, frequency=CURVE["frequency"], responses=[CURVE["response"]]),
 )
 PARTS = (

@@ -9,13 +9,23 @@ from hostile_table import IMAGE, MASKS, RANDOM, SENSOR, TWO, WAVE, ZONES, call, 
 
 import thincam_jax as tc
 from thincam_jax import design, hardware, learn, measured, studies
+from thincam_jax.design.fronts import non_dominated
+from thincam_jax.design.match import MatchSettings
+from thincam_jax.design.objectives import Tolerances, mismatch_error, worst_ratio_db
+from thincam_jax.design.ranking import score_design
+from thincam_jax.design.setup import fit_power_law
 from thincam_jax.hardware.acquisition import plan as plans
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
 from thincam_jax.hardware.stages.zaber import ZaberStage
 from thincam_jax.imaging.operators import Separable
+from thincam_jax.learn.suggester_training import SuggesterTraining
+from thincam_jax.learn.suggestions import Suggester
 from thincam_jax.measured import calibration
+from thincam_jax.measured.bayer import demosaic_mask
+from thincam_jax.measured.calibration.start import PsfSearch
+from thincam_jax.measured.write import log_text
 
 
 def space(base: Any, variable: Any, limits: Any) -> design.DesignSpace:
@@ -57,7 +67,7 @@ SPACE = call(
 RINGS = call(design.Polar, highest=80.0, count=64, directions=2)
 SEEN = {"setup": SETUP, "synthesis": np.eye(2), "frequencies": RINGS}
 KNOWN = call(design.channels, design=DESIGN, **SEEN)
-TOLERANCES = call(design.Tolerances, beta=0.01, distance=0.01, wavelength=1e-5, tilt=0.01)
+TOLERANCES = call(Tolerances, beta=0.01, distance=0.01, wavelength=1e-5, tilt=0.01)
 PROBLEM = call(
     design.design_problem,
     objective=call(design.BayesError),
@@ -74,16 +84,16 @@ DESIGNS = (
         design.shots, beta=[25.0, 13.0], distance=6.5, phases=[0.0, 1.0], wavelength=WAVE, width=5
     ),
     call(design.bayes_error, known=KNOWN),
-    call(design.mismatch_error, known=KNOWN, actual=KNOWN),
+    call(mismatch_error, known=KNOWN, actual=KNOWN),
     call(design.limit, known=KNOWN, frequencies=RINGS, ratio=1.0, rings=16),
     *(
         call(f, known=KNOWN, frequencies=RINGS, band=(0.05, 0.5), rings=16)
-        for f in (design.unevenness, design.worst_ratio_db)
+        for f in (design.unevenness, worst_ratio_db)
     ),
     call(design.ring_levels, known=KNOWN, frequencies=RINGS, rings=16),
     call(design.response_misfit, known=KNOWN, frequencies=RINGS, target=np.ones(8)),
     call(design.robust_error, design=DESIGN, tolerances=TOLERANCES, how="mean", **SEEN),
-    call(design.score_design, problem=PROBLEM, design=DESIGN, name="a"),
+    call(score_design, problem=PROBLEM, design=DESIGN, name="a"),
     call(
         design.find_designs,
         problem=PROBLEM,
@@ -95,11 +105,11 @@ DESIGNS = (
         design.match_response,
         model=call(design.ResponseModel, space=SPACE, **SEEN, rings=8),
         target=np.ones(8),
-        settings=call(design.MatchSettings, starts=1, samples=4, steps=2, tolerance=1e-3),
+        settings=call(MatchSettings, starts=1, samples=4, steps=2, tolerance=1e-3),
         key=KEY,
     ),
-    call(at_once(design.fit_power_law, "images"), images=RANDOM.random((32, 40))),
-    call(design.non_dominated, points=RANDOM.random((4, 2)), larger=(True, False)),
+    call(at_once(fit_power_law, "images"), images=RANDOM.random((32, 40))),
+    call(non_dominated, points=RANDOM.random((4, 2)), larger=(True, False)),
     call(design.MaskSetting, camera=camera(MASKS[-1]), wavelengths=WAVE, field_shape=(5, 6)),
     call(
         design.mask_of_phase,
@@ -172,7 +182,7 @@ STUDIES = (
 LEARNED = (
     call(learn.TrainingOptions, steps=5, rate=1e-3, warm_up=2, averaging=0.9, seed=0, falling=0.5),
     call(learn.NetworkOptions, steps=2, widths=(8, 8)),
-    call(learn.SuggesterTraining, samples=8, guesses=1, width=4, depth=1, rate=1e-3),
+    call(SuggesterTraining, samples=8, guesses=1, width=4, depth=1, rate=1e-3),
     call(
         learn.RefocusCamera,
         camera=camera(),
@@ -192,7 +202,7 @@ LEARNED = (
     call(
         learn.suggest,
         suggester=call(
-            learn.Suggester,
+            Suggester,
             model=call(design.ResponseModel, space=SPACE, **SEEN, rings=8),
             key=KEY,
             guesses=2,
@@ -259,7 +269,7 @@ CALIBRATIONS = (
         object_distance=250.0,
         wavelength=WAVE,
         search=call(
-            calibration.PsfSearch,
+            PsfSearch,
             parameters=("beta", "phase"),
             relative=0.1,
             centre=0.05,
@@ -289,13 +299,13 @@ CALIBRATIONS = (
     call(calibration.hadamard_pattern, index=1, object_shape=(2, 4), order="natural"),
     call(calibration.walsh_hadamard, values=RANDOM.random((4, 3))),
     call(measured.demosaic, mosaic=RANDOM.random((6, 8)), pattern="RGGB", method="bilinear"),
-    call(measured.demosaic_mask, mask=np.ones((6, 8), bool), pattern="RGGB", method="superpixel"),
+    call(demosaic_mask, mask=np.ones((6, 8), bool), pattern="RGGB", method="superpixel"),
     call(
         measured.to_display, image=TWO[:1], white_balance="grey_world", gamma=2.2, percentile=99.0
     ),
     call(measured.read_image, path="nothing", bits=12),
     call(measured.list_captures, folder="nothing", bits=12),
-    call(measured.log_text, log={"a": 1.0}),
+    call(log_text, log={"a": 1.0}),
     call(tc.load_image, path="nothing"),
 )
 

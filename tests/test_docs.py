@@ -27,6 +27,7 @@ from thincam_jax.commands import cli
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
+from thincam_jax.measured.write import log_text
 from thincam_jax.units import nm, um
 
 PACKAGE = ROOT / "thincam_jax"
@@ -142,7 +143,7 @@ def test_real_captures_page(tmp_path, monkeypatch, capsys):
     with PIL.Image.open("result.png") as shown:
         assert shown.mode == "RGB" and shown.size == (38, 30)
     assert json.loads((tmp_path / "result.json").read_text("utf-8")) == json.loads(
-        names["measured"].log_text(ready.log)
+        log_text(ready.log)
     )
     assert bool(jnp.isfinite(names["by_psf"]).all())
     for name in ("photo", "chart"):  # differences are taken in double precision

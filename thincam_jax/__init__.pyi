@@ -21,7 +21,6 @@ from .imaging.sensor import Sensor as Sensor
 from .imaging.targets.images import load_image as load_image
 from .learn.plug_and_play import PlugAndPlay as PlugAndPlay
 from .learn.refocusing.use import Learned as Learned
-from .lensless.accuracy import Selection as Selection
 from .lensless.accuracy import predict_error as predict_error
 from .lensless.accuracy import select_model as select_model
 from .lensless.camera import LenslessCamera as LenslessCamera
@@ -50,13 +49,11 @@ from .lensless.masks.reliefs import voronoi_fresnel as voronoi_fresnel
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import random_cells as random_cells
 from .lensless.masks.sampled import read_mask as read_mask
-from .lensless.method import MODELS as MODELS
 from .lensless.method import AccuracyWarning as AccuracyWarning
 from .lensless.method import PsfMethod as PsfMethod
 from .lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
 from .lensless.phase_shift import harmonic_otf as harmonic_otf
 from .lensless.phase_shift import phase_pair_otf as phase_pair_otf
-from .lensless.plan import Plan as Plan
 from .lensless.plan import plan as plan
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
@@ -72,10 +69,8 @@ from .reconstruction import Fista as Fista
 from .reconstruction import FringeScanning as FringeScanning
 from .reconstruction import InverseProblem as InverseProblem
 from .reconstruction import PoissonTV as PoissonTV
-from .reconstruction import PsfCheck as PsfCheck
 from .reconstruction import Psfs as Psfs
 from .reconstruction import Recording as Recording
-from .reconstruction import Refinement as Refinement
 from .reconstruction import Ridge as Ridge
 from .reconstruction import Stream as Stream
 from .reconstruction import TotalVariation as TotalVariation

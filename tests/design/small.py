@@ -10,7 +10,6 @@ import numpy as np
 from thincam_jax.design import (
     BayesError,
     Design,
-    DesignProblem,
     DesignSpace,
     FrequencyCounts,
     Limits,
@@ -21,6 +20,7 @@ from thincam_jax.design import (
     design_problem,
     shots,
 )
+from thincam_jax.design.problem import DesignProblem
 from thincam_jax.reconstruction import phase_pairs
 
 PAIR = (0.0, 1.5 * np.pi)

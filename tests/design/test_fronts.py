@@ -9,16 +9,15 @@ from design import small
 
 from thincam_jax.design import (
     DesignSpace,
-    FrontPoint,
     Limits,
-    NonFiniteObjectiveError,
     PhotonNoise,
     ResolutionLimit,
     SearchSettings,
     find_front,
     fronts,
-    non_dominated,
 )
+from thincam_jax.design.fronts import FrontPoint, non_dominated
+from thincam_jax.design.search import NonFiniteObjectiveError
 from thincam_jax.reconstruction import phase_pairs
 
 

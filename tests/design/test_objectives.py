@@ -21,18 +21,21 @@ from thincam_jax.design import (
     ResolutionLimit,
     RobustError,
     SignalNoise,
-    Tolerances,
     Unevenness,
     WorstRatio,
     bayes_error,
     channels,
     limit,
-    mismatch_error,
     robust_error,
     unevenness,
+)
+from thincam_jax.design.objectives import (
+    Channels,
+    Tolerances,
+    mismatch_error,
+    ring_means,
     worst_ratio_db,
 )
-from thincam_jax.design.objectives import Channels, ring_means
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction import phase_pairs
 

@@ -14,11 +14,8 @@ from thincam_jax.design import (
     PowerLaw,
     Setup,
     SignalNoise,
-    TrainedSensor,
-    Training,
     contour_target,
     cropped_error,
-    linear_error,
     linear_objective,
     mask_of_phase,
     match_objective,
@@ -27,9 +24,12 @@ from thincam_jax.design import (
     restored_objective,
     retrieve_phase,
 )
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape
+from thincam_jax.design.phase_mask import linear_error
+from thincam_jax.design.training import TrainedSensor, Training
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.targets import siemens_star
-from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.units import nm, um
 

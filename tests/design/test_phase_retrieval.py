@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design import contour_mask, contour_target, match_error, retrieve_phase
-from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.design import contour_mask, contour_target, retrieve_phase
+from thincam_jax.design.phase_retrieval import match_error
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.units import nm, um
 

@@ -9,21 +9,23 @@ import pytest
 from design import small
 
 from thincam_jax.design import (
-    DesignProblem,
     DesignSpace,
     Limits,
-    NonFiniteObjectiveError,
-    TrainingDescents,
     TrainingError,
-    TrainingSettings,
     build_training,
-    rank_trained,
     train_designs,
-    training_pixels,
     wiener_error,
 )
-from thincam_jax.design.search import evaluate
-from thincam_jax.design.training_search import base_point, start_points
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.ranking import rank_trained
+from thincam_jax.design.search import NonFiniteObjectiveError, evaluate
+from thincam_jax.design.training_search import (
+    TrainingDescents,
+    TrainingSettings,
+    base_point,
+    start_points,
+    training_pixels,
+)
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.reconstruction import phase_pairs
 

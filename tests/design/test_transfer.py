@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from thincam_jax.design import (
-    ObjectiveData,
     Polar,
     Quadrant,
     Setup,
@@ -17,7 +16,7 @@ from thincam_jax.design import (
     shots,
     transfer,
 )
-from thincam_jax.design.objectives import Channels
+from thincam_jax.design.objectives import Channels, ObjectiveData
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction import phase_pairs

@@ -11,6 +11,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick, value_and_slope
+from thincam_jax.lensless.method import MODELS
 
 INF = float("inf")
 WAVELENGTH = 500e-6
@@ -316,12 +317,12 @@ def test_impossible_distance(distance):
 def test_unknown_model_lists_the_known(evaluate, monkeypatch):
     """As a user meets it, without the type checks of the tests."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    listed = ", ".join(f"'{m}'" for m in tc.MODELS)
+    listed = ", ".join(f"'{m}'" for m in MODELS)
     with pytest.raises(
         ValueError, match=f"model = 'fraunhofer' is unknown; choose one of {listed}"
     ):
         evaluate(camera_of(), wavelength=WAVELENGTH, model="fraunhofer")
-    assert len(tc.MODELS) == 7
+    assert len(MODELS) == 7
 
 
 def test_text_for_a_length():

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from thincam_jax.measured import demosaic, demosaic_mask
-from thincam_jax.measured.bayer import PATTERNS, mosaic
+from thincam_jax.measured import demosaic
+from thincam_jax.measured.bayer import PATTERNS, demosaic_mask, mosaic
 
 
 def mosaic_of(image, pattern):

@@ -7,8 +7,8 @@ import pytest
 from design import small
 
 import thincam_jax as tc
-from thincam_jax.design import FreeValue, FrontPoint, Sensitivity
-from thincam_jax.design.sensitivity import Derivatives
+from thincam_jax.design.fronts import FrontPoint
+from thincam_jax.design.sensitivity import Derivatives, FreeValue, Sensitivity
 from thincam_jax.reconstruction import Psfs, Reconstruction
 
 matplotlib.use("Agg")

@@ -32,8 +32,8 @@ from thincam_jax.imaging.operators import (
     Separable,
     Sparse,
     Stacked,
-    kernel_shape,
 )
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.reconstruction.admm import admm_map
 from thincam_jax.reconstruction.normal_equations import (
     DenseNormal,

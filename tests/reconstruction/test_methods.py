@@ -12,18 +12,11 @@ from reconstruction import extremes, rig, scenes
 import thincam_jax as tc
 from helpers import relative_l2, shared_data
 from thincam_jax.imaging.operators import Matrix, low_rank_psf
-from thincam_jax.reconstruction import (
-    SOLVERS,
-    Cosines,
-    Reconstruction,
-    Sparsity,
-    Wavelet,
-    WienerSynthesis,
-    phase_pairs,
-    separate,
-)
+from thincam_jax.reconstruction import Reconstruction, WienerSynthesis, phase_pairs, separate
+from thincam_jax.reconstruction.methods import SOLVERS
 from thincam_jax.reconstruction.problem import residuals
 from thincam_jax.reconstruction.recording import centred_crop
+from thincam_jax.reconstruction.regularisers import Cosines, Sparsity, Wavelet
 
 RNG = np.random.default_rng(1)
 PAIR = np.array([[1.0, -1.0]])

@@ -14,10 +14,9 @@ from thincam_jax.imaging.operators import (
     Scaled,
     Separable,
     Stacked,
-    kernel_shape,
-    window_shape,
 )
 from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     gradient,

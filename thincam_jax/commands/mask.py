@@ -16,6 +16,7 @@ from thincam_jax.imaging.targets import load_image
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.masks.cells import Combination
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.lensless.propagation.path import Path
 
 APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
@@ -61,7 +62,7 @@ def _phases(path: str, width: float) -> masks.SampledMask:
 
 
 def _contours(
-    key: int, blank: masks.MaskBlank, light: Path, *, feature: float, line_width: float
+    key: int, blank: MaskBlank, light: Path, *, feature: float, line_width: float
 ) -> masks.PhaseMask:
     from thincam_jax.design import contour_mask  # slow, and not needed by other masks
 
@@ -185,7 +186,7 @@ def built_mask(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
     parameters = inspect.signature(maker).parameters
     if "blank" in parameters:
         count = checks.whole_cells("width", config.width, "cell", config.cell or 0.0)
-        numbers["blank"] = masks.MaskBlank((count, count), config.cell or 0.0, config.index)
+        numbers["blank"] = MaskBlank((count, count), config.cell or 0.0, config.index)
     given = {name: numbers.get(name) for name in parameters}
     mask = maker(**{name: value for name, value in given.items() if value is not None})
     if config.family == "fza" or config.pixel_pitch is None:

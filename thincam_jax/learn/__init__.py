@@ -9,11 +9,7 @@ from thincam_jax.learn.refocusing.store import load as load
 from thincam_jax.learn.refocusing.store import save as save
 from thincam_jax.learn.refocusing.train import Lessons as Lessons
 from thincam_jax.learn.refocusing.train import train as train
-from thincam_jax.learn.refocusing.use import Learned as Learned
-from thincam_jax.learn.suggester_training import SuggesterTraining as SuggesterTraining
 from thincam_jax.learn.suggester_training import train_suggester as train_suggester
-from thincam_jax.learn.suggestions import Suggester as Suggester
-from thincam_jax.learn.suggestions import Suggestion as Suggestion
 from thincam_jax.learn.suggestions import load_suggester as load_suggester
 from thincam_jax.learn.suggestions import propose as propose
 from thincam_jax.learn.suggestions import save_suggester as save_suggester

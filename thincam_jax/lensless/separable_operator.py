@@ -12,7 +12,8 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators import Separable, Truncated, kernel_grid, orthogonal_terms
+from thincam_jax.imaging.operators import Separable, kernel_grid
+from thincam_jax.imaging.operators.separable import Truncated, orthogonal_terms
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape

@@ -7,7 +7,6 @@ What reports show of a study, a refocusing, a screen, a rig, a sweep or a traini
 of these names, such as `thincam_jax.plot.screen`; results draw their main figure by `plot()`.
 """
 
-from thincam_jax.plot.cameras import draw_psf as draw_psf
 from thincam_jax.plot.cameras import mask as mask
 from thincam_jax.plot.cameras import otf as otf
 from thincam_jax.plot.cameras import psf as psf

@@ -12,7 +12,8 @@ from thincam_jax.reconstruction import Reconstruction
 
 # The figures of reconstructions wait for no design.
 if TYPE_CHECKING:
-    from thincam_jax.design import FrontPoint, Sensitivity
+    from thincam_jax.design.fronts import FrontPoint
+    from thincam_jax.design.sensitivity import Sensitivity
 
 
 @checked

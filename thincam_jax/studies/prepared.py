@@ -13,20 +13,20 @@ from jaxtyping import Float
 from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.imaging.operators import window_shape
+from thincam_jax.imaging.operators.crop_convolution import window_shape
 from thincam_jax.lensless.psf import psf
-from thincam_jax.measured import MeasurementError, Prepared, Raw
+from thincam_jax.measured import MeasurementError, Raw
+from thincam_jax.measured.preparation import Prepared
 from thincam_jax.reconstruction import (
     AbstractSolver,
     Cameras,
     InverseProblem,
-    Progress,
     Psfs,
     Reconstruction,
     Recording,
     reconstruct,
 )
-from thincam_jax.reconstruction.iterate import Callback
+from thincam_jax.reconstruction.iterate import Callback, Progress
 from thincam_jax.reconstruction.methods import AbstractRegularised
 from thincam_jax.reconstruction.noise import demosaiced_noise, estimate_variance
 from thincam_jax.reconstruction.problem import relative_residual

@@ -17,7 +17,7 @@ from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import kernel_shape
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.exposures import Exposure

@@ -27,6 +27,13 @@ from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.measured import calibration
 from thincam_jax.measured.bayer import Pattern, mosaic
+from thincam_jax.measured.calibration.alignment import (
+    Alignment,
+    MapKind,
+    fit_alignment,
+    locate_mark,
+)
+from thincam_jax.measured.calibration.captures import HadamardCaptures
 from thincam_jax.reconstruction import AbstractSolver, Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
 from thincam_jax.studies.evaluate import as_picture, rounded, sample
@@ -217,7 +224,7 @@ class MeasuredMatrix:
 
 def recover_to(
     folder: Path,
-    captures: calibration.HadamardCaptures,
+    captures: HadamardCaptures,
     exact: tuple[Sparse, CountingCamera, Pixels] | None = None,
 ) -> MeasuredMatrix:
     """Recover the matrix of captures into a folder, block by block: matrix.zarr, reduced.npz.
@@ -336,8 +343,8 @@ def align_display(
     frames: Float[np.ndarray, "frame y x"],
     shown: Sequence[np.ndarray],
     pitch: float,
-    kind: calibration.MapKind,
-) -> calibration.Alignment:
+    kind: MapKind,
+) -> Alignment:
     """Find a display before a study's first camera, by frames of a mark each.
 
     - `study`: its `config` has the object's width, within which marks are looked for.
@@ -357,11 +364,11 @@ def align_display(
     seen = []
     for mark in range(len(marks)):
         mean = frames[number == mark].mean(axis=0, dtype=float)
-        found = calibration.locate_mark(mean, psf, radius)
+        found = locate_mark(mean, psf, radius)
         seen.append(found and (pixel * found[0], pixel**2 * found[1]))
     on_display = pitch * (marks - middle)[:, ::-1]
     display = (shown[0].shape[0], shown[0].shape[1]), pitch
-    return calibration.fit_alignment(display, on_display, seen, kind, abs(pixel))
+    return fit_alignment(display, on_display, seen, kind, abs(pixel))
 
 
 class _KnownRows:
@@ -376,7 +383,7 @@ class _KnownRows:
 
 
 def _exact_matrix(
-    captures: calibration.HadamardCaptures, system: Sparse, camera: CountingCamera, pixels: Pixels
+    captures: HadamardCaptures, system: Sparse, camera: CountingCamera, pixels: Pixels
 ):
     """The matrix of direct simulation in counts, and the noise of each pixel's entries."""
     numbers = np.arange(math.prod(system.out_shape)).reshape(system.out_shape)

@@ -35,7 +35,8 @@ from thincam_jax.studies.pictures import (
 from thincam_jax.studies.screen_mask import MaskSystem, ScreenMask, require_mask_fits
 from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.hologram import directions
-from thincam_jax.waveguide.rays import bragg_rays
+from thincam_jax.waveguide.rays import Rays, bragg_rays
+from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import colour_operator, seen_size, smeared_rays, system_matrix
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ class ScreenStudy:
         """The camera of the middle colour, green."""
         return self.cameras[len(self.cameras) // 2]
 
-    def rays(self, camera: wg.SeeThroughCamera | None = None) -> wg.Rays:
+    def rays(self, camera: wg.SeeThroughCamera | None = None) -> Rays:
         """Rays of every pixel and order of a camera; by default of `camera`."""
         camera = camera or self.camera
         return wg.trace(camera, wg.pixel_centres(camera), self.plane.distance, self.orders)
@@ -254,9 +255,7 @@ def with_glass(camera: wg.SeeThroughCamera, thickness: float) -> wg.SeeThroughCa
     return replace(camera, screen=replace(camera.screen, glass_thickness=thickness))
 
 
-def mistaken_rays(
-    study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mistake
-) -> wg.SmearedRays:
+def mistaken_rays(study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mistake) -> SmearedRays:
     """The rays of a camera, followed with one of `MISTAKES`.
 
     **Errors**: ValueError for "grating" in a study without `recording_angles`.
@@ -265,13 +264,13 @@ def mistaken_rays(
     samples = None if mistake == "no_smear" else study.band_samples
     rays = smeared_rays(camera, pixels, plane, study.orders, samples)
     if mistake == "no_ghosts":
-        return wg.SmearedRays(rays.points[:1], rays.weight[:1])
+        return SmearedRays(rays.points[:1], rays.weight[:1])
     if mistake == "shift_invariant":
         middle = jnp.zeros((1, 1, 2), pixels.dtype)
         axis = smeared_rays(camera, middle, plane, study.orders, samples)
         scale = (camera.lens_distance + plane.distance) / camera.focal_distance
         points = axis.points - scale * pixels[..., None, :]
-        return wg.SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
+        return SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
     if mistake not in ("ghost_index", "grating"):
         return rays
     found = bragg_rays(camera, pixels)
@@ -422,7 +421,7 @@ class RaySummary:
         )
 
 
-def summarise_rays(study: ScreenStudy, rays: wg.Rays) -> RaySummary:
+def summarise_rays(study: ScreenStudy, rays: Rays) -> RaySummary:
     """Colours, angles of the guided light, shifts of the first ghost, and how rays ended."""
     status = np.asarray(rays.status)
     index = np.asarray(study.camera.screen.glass_index(rays.wavelength))

@@ -31,7 +31,7 @@ from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatri
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.measured import calibration as measuring
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, Order
-from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS, QUANTITIES
+from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS, QUANTITIES, ScreenFit
 from thincam_jax.studies.evaluate import rounded
 from thincam_jax.studies.pictures import (
     Reconstructed,
@@ -277,7 +277,7 @@ class CalibrationRun:
     """A calibration step by step: `work` fills what `result` holds."""
 
     measured: SystemMatrix
-    fit: measuring.ScreenFit
+    fit: ScreenFit
 
     def __init__(self, study: ScreenStudy, calibration: Calibration, folder: Path | None = None):
         colours = len(study.cameras) > 1

@@ -26,6 +26,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks import AbstractMask
 from thincam_jax.lensless.method import MODELS, Model
 from thincam_jax.lensless.psf import psf
+from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import seen_size, system_matrix
 
 MASK_MISTAKES = ("none", "shift_invariant", "no_ghosts")
@@ -170,6 +171,6 @@ def first_image(
         raise ValueError("the object reaches beyond what the screen shows; give a smaller width")
     field = 2 * math.ceil(rows), 2 * math.ceil(columns)
     rays = wg.trace(camera, field_points(field, pitch), plane.distance, 1)
-    smeared = wg.SmearedRays(rays.points[..., None, :2], jnp.ones_like(rays.weight))
+    smeared = SmearedRays(rays.points[..., None, :2], jnp.ones_like(rays.weight))
     size = float(pitch) * float(np.ptp(edge) / np.ptp(places))
     return system_matrix(smeared, plane, size, 1.0), field

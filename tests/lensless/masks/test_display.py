@@ -8,7 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2, value_and_slope
-from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
 
 WAVELENGTH, DISTANCE, PITCH, FILL = 550 * nm, 2.0, 0.03, 0.64

@@ -11,7 +11,8 @@ from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.masks import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.units import nm, um
 

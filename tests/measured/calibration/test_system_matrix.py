@@ -12,7 +12,6 @@ from helpers import full_disk
 from thincam_jax._core.files import WriteError
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration import (
-    CaptureStoreError,
     HadamardSeries,
     create_captures,
     matrix_blocks,
@@ -22,6 +21,7 @@ from thincam_jax.measured.calibration import (
     stored_blocks,
     write_matrix,
 )
+from thincam_jax.measured.calibration.captures import CaptureStoreError
 
 CELLS, SHAPE = (4, 8), (12, 10)
 TRUTH = np.random.default_rng(2).uniform(size=(120, 32))

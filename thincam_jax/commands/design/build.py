@@ -15,10 +15,8 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.commands.study import build
 from thincam_jax.design import (
-    AbstractObjective,
     BayesError,
     Design,
-    DesignProblem,
     PhotonNoise,
     PowerLaw,
     ResolutionLimit,
@@ -26,13 +24,14 @@ from thincam_jax.design import (
     Setup,
     SignalNoise,
     TrainingError,
-    TrainingSettings,
     Unevenness,
     WorstRatio,
     design_problem,
-    fit_power_law,
 )
-from thincam_jax.design.objectives import OBJECTIVES
+from thincam_jax.design.objectives import OBJECTIVES, AbstractObjective
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.setup import fit_power_law
+from thincam_jax.design.training_search import TrainingSettings
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.learn import Denoiser
 from thincam_jax.studies.design import DesignStudy, FrontPlan, TrainingPlan, as_method

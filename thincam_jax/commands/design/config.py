@@ -31,14 +31,14 @@ from thincam_jax.design import (
     PhotonNoise,
     SearchSettings,
     SignalNoise,
-    Tolerances,
     TrainingError,
-    TrainingSettings,
     Variable,
-    found_name,
     shots,
 )
+from thincam_jax.design.objectives import Tolerances
+from thincam_jax.design.ranking import found_name
 from thincam_jax.design.space import QUANTITIES
+from thincam_jax.design.training_search import TrainingSettings
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.units import parse_quantity

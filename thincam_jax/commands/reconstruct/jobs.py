@@ -19,6 +19,7 @@ from thincam_jax.measured.dark import without_hot_pixels
 from thincam_jax.measured.examination import Examination, Finding, examine
 from thincam_jax.measured.merging import merge_images
 from thincam_jax.measured.preparation import Background as Level
+from thincam_jax.measured.preparation import Prepared
 from thincam_jax.measured.read import image_files, pair_backgrounds
 from thincam_jax.measured.write import LINEAR
 
@@ -92,11 +93,11 @@ class Rig:
         psf = self.psfs[job.focus or 0]
         return examine([image], psf, self.sources.preparation), background
 
-    def prepare(self, capture: Path) -> measured.Prepared:
+    def prepare(self, capture: Path) -> Prepared:
         paired = tuple(pair_backgrounds([capture], self.sources.background))
         return self.ready(*self.examine(Job(capture, (), backgrounds=paired)))
 
-    def ready(self, examined: Examination, background: Level | None) -> measured.Prepared:
+    def ready(self, examined: Examination, background: Level | None) -> Prepared:
         psf, (image,) = examined.psf, examined.captures
         assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}

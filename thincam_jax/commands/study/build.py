@@ -20,6 +20,7 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.imaging.targets.images import placed
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.evaluate import check_cameras, check_target
@@ -135,7 +136,7 @@ def picture(
         picture = np.broadcast_to(picture, (*picture.shape[:2], channels))
     if target.binary:
         picture = (picture > picture.mean()).astype(float)
-    picture = drawn.placed(picture, target.width, (target.y, target.x), target.rotation)
+    picture = placed(picture, target.width, (target.y, target.x), target.rotation)
     if picture.min() == picture.max():
         raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
     return picture

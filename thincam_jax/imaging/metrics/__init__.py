@@ -10,7 +10,5 @@ from thincam_jax.imaging.metrics.image import ssim as ssim
 from thincam_jax.imaging.metrics.mtf import cut_off as cut_off
 from thincam_jax.imaging.metrics.mtf import first_common_zero as first_common_zero
 from thincam_jax.imaging.metrics.mtf import low_frequency_value as low_frequency_value
-from thincam_jax.imaging.metrics.mtf import zero_crossings as zero_crossings
-from thincam_jax.imaging.metrics.usaf import UsafContrast as UsafContrast
 from thincam_jax.imaging.metrics.usaf import resolved_element as resolved_element
 from thincam_jax.imaging.metrics.usaf import usaf_contrast as usaf_contrast

@@ -1,4 +1,3 @@
 """A denoiser of grey images that knows no camera: its network, its training and its file."""
 
-from thincam_jax.learn.denoiser.network import network_card as network_card
 from thincam_jax.learn.denoiser.pictures import drawn as drawn

@@ -2,14 +2,11 @@
 
 from thincam_jax.lensless.masks.base import AbstractFactoredMask as AbstractFactoredMask
 from thincam_jax.lensless.masks.base import AbstractMask as AbstractMask
-from thincam_jax.lensless.masks.base import AxisFactors as AxisFactors
-from thincam_jax.lensless.masks.base import MaskTerms as MaskTerms
 from thincam_jax.lensless.masks.cells import SeparableMask as SeparableMask
 from thincam_jax.lensless.masks.cells import maximum_length_sequence as maximum_length_sequence
 from thincam_jax.lensless.masks.display import on_display as on_display
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from thincam_jax.lensless.masks.lenslets import LensletArray as LensletArray
-from thincam_jax.lensless.masks.phase import MaskBlank as MaskBlank
 from thincam_jax.lensless.masks.phase import PhaseMask as PhaseMask
 from thincam_jax.lensless.masks.pinhole import Pinhole as Pinhole
 from thincam_jax.lensless.masks.pinhole import RadialMask as RadialMask

@@ -1,6 +1,5 @@
 """Propagation models, from the geometric shadow to the Rayleigh-Sommerfeld integral."""
 
-from thincam_jax.lensless.propagation.angular_spectrum import Sampling as Sampling
 from thincam_jax.lensless.propagation.angular_spectrum import (
     angular_spectrum_sampling as angular_spectrum_sampling,
 )
@@ -8,4 +7,3 @@ from thincam_jax.lensless.propagation.angular_spectrum import propagate as propa
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum as ChirpSum
 from thincam_jax.lensless.propagation.paraxial import paraxial_response as paraxial_response
 from thincam_jax.lensless.propagation.path import Path as Path
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum as SeparableSum
