@@ -17,7 +17,9 @@ from thincam_jax._core import image_files
 from thincam_jax.commands.config_file import ConfigError, read_raw
 from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.learn.checkpoint import CheckpointError, read_description
-from thincam_jax.measured import CaptureFileError, NonlinearWarning, read_image
+from thincam_jax.measured import read_image
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import NonlinearWarning
 from thincam_jax.measured.sensor import SensorCalibration
 
 SHAPE = (21, 34)

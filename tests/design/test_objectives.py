@@ -11,29 +11,23 @@ from design import small
 from design.setting import HIGHEST, setup
 
 from helpers import count_traces, finite_difference
-from thincam_jax.design import (
-    BayesError,
-    Design,
-    PhotonNoise,
-    Polar,
-    PowerLaw,
-    Quadrant,
+from thincam_jax.design import BayesError, PhotonNoise, Polar, PowerLaw, SignalNoise
+from thincam_jax.design.design import Design
+from thincam_jax.design.frequencies import Quadrant
+from thincam_jax.design.objectives import (
+    Channels,
     ResolutionLimit,
     RobustError,
-    SignalNoise,
+    Tolerances,
     Unevenness,
     WorstRatio,
     bayes_error,
     channels,
     limit,
-    robust_error,
-    unevenness,
-)
-from thincam_jax.design.objectives import (
-    Channels,
-    Tolerances,
     mismatch_error,
     ring_means,
+    robust_error,
+    unevenness,
     worst_ratio_db,
 )
 from thincam_jax.lensless.exposures import Exposures

@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 from design.setting import setup, thesis_design
 
-from thincam_jax.design import Design, Polar, PowerLaw, bayes_error, channels, robust_error
-from thincam_jax.design.objectives import Tolerances, mismatch_error
+from thincam_jax.design import Polar, PowerLaw
+from thincam_jax.design.design import Design
+from thincam_jax.design.objectives import (
+    Tolerances,
+    bayes_error,
+    channels,
+    mismatch_error,
+    robust_error,
+)
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 

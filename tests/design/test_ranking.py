@@ -6,9 +6,8 @@ import pytest
 from design import small
 from design.test_sensitivity import Bowl, found_at
 
-from thincam_jax.design import bayes_error, rank_designs
-from thincam_jax.design.objectives import ring_means
-from thincam_jax.design.ranking import distinct_designs, score_design
+from thincam_jax.design.objectives import bayes_error, ring_means
+from thincam_jax.design.ranking import distinct_designs, rank_designs, score_design
 from thincam_jax.design.search import NonFiniteObjectiveError
 
 

@@ -7,7 +7,8 @@ import pytest
 from design.setting import HIGHEST, error, setup, two_betas
 
 from helpers import count_traces, in_full, quick
-from thincam_jax.design import Polar, PowerLaw, SearchSettings, evaluate_grid, find_designs
+from thincam_jax.design import Polar, PowerLaw, SearchSettings, find_designs
+from thincam_jax.design.landscape import evaluate_grid
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.search import random_search
 

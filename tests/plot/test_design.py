@@ -7,7 +7,8 @@ import pytest
 from design import small
 from studies.test_design_result import fronts
 
-from thincam_jax.design import BayesError, Landscape
+from thincam_jax.design import BayesError
+from thincam_jax.design.landscape import Landscape
 from thincam_jax.design.ranking import RankedDesign
 from thincam_jax.design.sensitivity import FreeValue
 from thincam_jax.design.transfer import ModulationTransfer

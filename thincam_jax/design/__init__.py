@@ -1,53 +1,16 @@
 """Finding the best camera by gradient: objectives, spaces, searches, fronts and sensitivity."""
 
-from thincam_jax.design.design import Design as Design
+from thincam_jax._core.names import modules_of
 from thincam_jax.design.design import shots as shots
-from thincam_jax.design.end_to_end import end_to_end_error as end_to_end_error
 from thincam_jax.design.frequencies import Polar as Polar
-from thincam_jax.design.frequencies import Quadrant as Quadrant
 from thincam_jax.design.fronts import find_front as find_front
-from thincam_jax.design.landscape import Landscape as Landscape
-from thincam_jax.design.landscape import evaluate_grid as evaluate_grid
 from thincam_jax.design.landscape import landscape_around as landscape_around
 from thincam_jax.design.layout import write_gds as write_gds
 from thincam_jax.design.match import ResponseModel as ResponseModel
 from thincam_jax.design.match import match_response as match_response
-from thincam_jax.design.match import response_misfit as response_misfit
-from thincam_jax.design.match import ring_levels as ring_levels
 from thincam_jax.design.objectives import BayesError as BayesError
-from thincam_jax.design.objectives import ResolutionLimit as ResolutionLimit
-from thincam_jax.design.objectives import RobustError as RobustError
-from thincam_jax.design.objectives import Unevenness as Unevenness
-from thincam_jax.design.objectives import WorstRatio as WorstRatio
-from thincam_jax.design.objectives import bayes_error as bayes_error
-from thincam_jax.design.objectives import channels as channels
-from thincam_jax.design.objectives import limit as limit
-from thincam_jax.design.objectives import robust_error as robust_error
-from thincam_jax.design.objectives import unevenness as unevenness
-from thincam_jax.design.phase_mask import HeightLimits as HeightLimits
-from thincam_jax.design.phase_mask import MaskSetting as MaskSetting
-from thincam_jax.design.phase_mask import contour_mask as contour_mask
-from thincam_jax.design.phase_mask import cropped_error as cropped_error
-from thincam_jax.design.phase_mask import linear_objective as linear_objective
-from thincam_jax.design.phase_mask import mask_of_phase as mask_of_phase
-from thincam_jax.design.phase_mask import match_objective as match_objective
-from thincam_jax.design.phase_mask import one_turn as one_turn
-from thincam_jax.design.phase_mask import refine_mask as refine_mask
-from thincam_jax.design.phase_mask import restored_objective as restored_objective
-from thincam_jax.design.phase_retrieval import contour_target as contour_target
-from thincam_jax.design.phase_retrieval import retrieve_phase as retrieve_phase
-from thincam_jax.design.plate import Plate as Plate
-from thincam_jax.design.plate import PlateLimits as PlateLimits
-from thincam_jax.design.plate import Viewing as Viewing
-from thincam_jax.design.plate import find_plate as find_plate
-from thincam_jax.design.plate import judge_plate as judge_plate
-from thincam_jax.design.plate import noise_variance as noise_variance
 from thincam_jax.design.problem import FrequencyCounts as FrequencyCounts
 from thincam_jax.design.problem import design_problem as design_problem
-from thincam_jax.design.ranking import rank_designs as rank_designs
-from thincam_jax.design.relief_files import read_height_map as read_height_map
-from thincam_jax.design.relief_files import write_height_map as write_height_map
-from thincam_jax.design.relief_files import write_stl as write_stl
 from thincam_jax.design.search import SearchSettings as SearchSettings
 from thincam_jax.design.search import find_designs as find_designs
 from thincam_jax.design.sensitivity import sensitivity_around as sensitivity_around
@@ -56,11 +19,6 @@ from thincam_jax.design.setup import PowerLaw as PowerLaw
 from thincam_jax.design.setup import Setup as Setup
 from thincam_jax.design.setup import SignalNoise as SignalNoise
 from thincam_jax.design.space import DesignSpace as DesignSpace
-from thincam_jax.design.space import Limits as Limits
 from thincam_jax.design.space import Variable as Variable
-from thincam_jax.design.stochastic import stochastic_descent as stochastic_descent
-from thincam_jax.design.training_search import TrainingError as TrainingError
-from thincam_jax.design.training_search import build_training as build_training
-from thincam_jax.design.training_search import train_designs as train_designs
-from thincam_jax.design.transfer import modulation_transfer as modulation_transfer
-from thincam_jax.design.wiener import wiener_error as wiener_error
+
+__getattr__ = modules_of(__name__)

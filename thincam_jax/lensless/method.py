@@ -61,10 +61,10 @@ class AccuracyWarning(UserWarning):
 
     import thincam_jax as tc
 
-    warnings.simplefilter("ignore", tc.AccuracyWarning)
+    warnings.simplefilter("ignore", tc.lensless.AccuracyWarning)
     ```
 
-    **See also**: `PsfMethod`, `SamplingWarning`.
+    **See also**: `PsfMethod`, `lensless.sampling.SamplingWarning`.
     """
 
 

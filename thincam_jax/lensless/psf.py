@@ -174,7 +174,7 @@ def otf(
     print(H.shape)  # (24, 32)
     ```
 
-    **See also**: `psf`, `fringe_scanned_otf`.
+    **See also**: `psf`, `lensless.phase_shift.fringe_scanned_otf`.
     """
     path = camera.path(wavelength, object_distance, at)
     return _evaluate(_otf, camera, path, as_method(model, pixel_integration))

@@ -17,24 +17,17 @@ from jaxtyping import PRNGKeyArray
 
 from thincam_jax._core.precision import allow, cast, decimal_value, precision_of
 from thincam_jax._core.steps import Progress, Step, carry_out
-from thincam_jax.design import (
-    Design,
-    Landscape,
-    SearchSettings,
-    TrainingError,
-    build_training,
-    find_designs,
-    modulation_transfer,
-    rank_designs,
-)
+from thincam_jax.design import SearchSettings, find_designs
+from thincam_jax.design.design import Design
 from thincam_jax.design.fronts import FrontPoint, FrontSearch, front_point, search_order
-from thincam_jax.design.landscape import landscape_if_any
+from thincam_jax.design.landscape import Landscape, landscape_if_any
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.ranking import (
     RankedDesign,
     distinct_designs,
     found_name,
+    rank_designs,
     rank_trained,
     score_design,
 )
@@ -43,10 +36,12 @@ from thincam_jax.design.setup import PhotonNoise
 from thincam_jax.design.training_search import (
     TrainedDesigns,
     TrainingDescents,
+    TrainingError,
     TrainingSettings,
+    build_training,
     training_pixels,
 )
-from thincam_jax.design.transfer import ModulationTransfer
+from thincam_jax.design.transfer import ModulationTransfer, modulation_transfer
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture

@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float
 from thincam_jax import waveguide as wg
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import CropConvolution, LowRank, ReducedMatrix, Sparse
+from thincam_jax.imaging.operators import CropConvolution, ReducedMatrix, Sparse
+from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.forward import imaging_operator
@@ -34,8 +35,10 @@ from thincam_jax.measured.calibration.alignment import (
     locate_mark,
 )
 from thincam_jax.measured.calibration.captures import HadamardCaptures
-from thincam_jax.reconstruction import AbstractSolver, Reconstruction
+from thincam_jax.measured.calibration.system_matrix import open_matrix, stored_blocks, write_matrix
+from thincam_jax.reconstruction import AbstractSolver
 from thincam_jax.reconstruction.noise import estimate_noise
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.evaluate import as_picture, rounded, sample
 from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
 from thincam_jax.studies.rig_images import FrameSolver, square_field
@@ -235,15 +238,15 @@ def recover_to(
     path, shape = folder / "matrix.zarr", captures.series.object_shape
     shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
     began = time.perf_counter()
-    calibration.write_matrix(captures, path)
-    matrix = calibration.open_matrix(path)
+    write_matrix(captures, path)
+    matrix = open_matrix(path)
     ReducedMatrix.of(matrix, shape).save(folder / "reduced.npz", matrix)
     cells, pixel_count = diagonal_cells(shape), math.prod(captures.sensor_shape)
     numbers = [row * shape[1] + column for row, column in cells]
     columns = np.empty((len(cells), pixel_count), np.float32)
     known = None if exact is None else _exact_matrix(captures, *exact)
     total, count = 0.0, 0
-    for pixels, block in calibration.stored_blocks(path):
+    for pixels, block in stored_blocks(path):
         columns[:, pixels] = block[:, numbers].T
         if known is not None:
             matrix, deviation = known
@@ -279,7 +282,7 @@ def calibrated(path: Path, folder: Path) -> tuple[Any, ReducedMatrix]:
     if not path.with_name("reduced.npz").is_file():
         recover_to(folder, calibration.open_captures(path))
         path = folder / "matrix.zarr"
-    matrix = calibration.open_matrix(path)
+    matrix = open_matrix(path)
     return matrix, ReducedMatrix.load(path.with_name("reduced.npz"), matrix)
 
 

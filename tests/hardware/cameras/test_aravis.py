@@ -10,7 +10,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from thincam_jax.hardware import CameraSettings, Region
+from thincam_jax.hardware import CameraSettings
+from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.errors import (
     Busy,
     Disconnected,

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hardware.cameras import pylablib_double
 
-from thincam_jax.hardware import CameraSettings, Identity, Region
+from thincam_jax.hardware import CameraSettings
+from thincam_jax.hardware.base import Identity, Region
 from thincam_jax.hardware.errors import (
     Disconnected,
     IncompleteFrame,

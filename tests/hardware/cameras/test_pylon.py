@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thincam_jax.hardware import CameraSettings, Region
+from thincam_jax.hardware import CameraSettings
+from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.errors import Disconnected, IncompleteFrame, NotFound, OutOfRange, Timeout
 from thincam_jax.hardware.registry import open_device
 from thincam_jax.hardware.virtual.faults import Faults

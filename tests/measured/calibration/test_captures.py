@@ -12,9 +12,8 @@ from thincam_jax.measured.calibration import (
     create_captures,
     open_captures,
     recover_matrix,
-    resume_captures,
 )
-from thincam_jax.measured.calibration.captures import CaptureStoreError
+from thincam_jax.measured.calibration.captures import CaptureStoreError, resume_captures
 
 SERIES = HadamardSeries((4, 8), "natural", "binary", dark_frames=3)
 SHAPE = (5, 7)

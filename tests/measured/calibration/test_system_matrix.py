@@ -14,14 +14,16 @@ from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration import (
     HadamardSeries,
     create_captures,
-    matrix_blocks,
-    read_matrix,
     recover_matrix,
     simulate_captures,
+)
+from thincam_jax.measured.calibration.captures import CaptureStoreError
+from thincam_jax.measured.calibration.system_matrix import (
+    matrix_blocks,
+    read_matrix,
     stored_blocks,
     write_matrix,
 )
-from thincam_jax.measured.calibration.captures import CaptureStoreError
 
 CELLS, SHAPE = (4, 8), (12, 10)
 TRUTH = np.random.default_rng(2).uniform(size=(120, 32))

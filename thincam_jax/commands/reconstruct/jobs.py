@@ -14,13 +14,14 @@ from thincam_jax import measured
 from thincam_jax._core.files import write_whole, writing
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.options import Background, Output, Sources
-from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
+from thincam_jax.measured import MeasurementError, write_image
 from thincam_jax.measured.dark import without_hot_pixels
 from thincam_jax.measured.examination import Examination, Finding, examine
 from thincam_jax.measured.merging import merge_images
 from thincam_jax.measured.preparation import Background as Level
 from thincam_jax.measured.preparation import Prepared
-from thincam_jax.measured.read import image_files, pair_backgrounds
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import image_files, pair_backgrounds, read_images
 from thincam_jax.measured.write import LINEAR
 
 
@@ -75,7 +76,7 @@ class Rig:
             self.psfs = [given]
         elif sources.distances:
             assert isinstance(given, Path)
-            self.psfs = measured.read_images(given, psf_bits)
+            self.psfs = read_images(given, psf_bits)
             if len(self.psfs) != len(sources.distances):
                 raise MeasurementError(
                     f"{given}: holds {len(self.psfs)} PSFs for {len(sources.distances)} distances; "

@@ -22,12 +22,13 @@ from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, 
 from thincam_jax.measured.examination import Finding, finding
 from thincam_jax.measured.preparation import Prepared
 from thincam_jax.measured.write import LINEAR, linear_bytes
-from thincam_jax.reconstruction import TotalVariation, check_psf, choose_solver, refine
+from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.reconstruction.depth.find import depth_of_colours
 from thincam_jax.reconstruction.iterate import Progress
+from thincam_jax.reconstruction.methods import choose_solver
 from thincam_jax.reconstruction.other_psf import RESIZE, TURN
-from thincam_jax.reconstruction.psf_check import blocks_blur
-from thincam_jax.reconstruction.refinement import changed_psf
+from thincam_jax.reconstruction.psf_check import blocks_blur, check_psf
+from thincam_jax.reconstruction.refinement import changed_psf, refine
 from thincam_jax.studies.prepared import (
     PixelNoise,
     PreparedResult,

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import usb.core
 
-from thincam_jax.hardware import CameraSettings, Identity, Region
-from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
+from thincam_jax.hardware import CameraSettings
+from thincam_jax.hardware.base import Identity, Region
+from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
 from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS
 from thincam_jax.hardware.errors import (
     Busy,
