@@ -21,12 +21,15 @@ FACES = (
 )
 # Modules of which scripts and tests call functions by their path.
 MODULES = (
-    *("design.end_to_end", "design.fronts", "design.match", "design.objectives", "design.plate"),
-    *("design.phase_mask", "design.phase_retrieval", "design.ranking"),
-    *("design.sensitivity", "design.training", "design.training_search", "learn.suggestions"),
-    *("learn.refocusing.network", "learn.refocusing.train", "learn.suggester_training"),
-    *("lensless.masks.reliefs", "measured.calibration.screen_fit", "reconstruction.depth.find"),
-    *("studies.mask_comparison", "studies.study", "waveguide.rays", "waveguide.screen_to_sensor"),
+    *("design.end_to_end", "design.fronts", "design.match"),
+    *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
+    *("design.plate", "design.ranking", "design.sensitivity"),
+    *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
+    *("learn.suggester_training", "learn.suggestions", "lensless.masks.reliefs"),
+    *("measured.calibration.screen_fit", "measured.exposures", "measured.sensor"),
+    *("reconstruction.depth.find", "reconstruction.problem", "studies.mask_comparison"),
+    *("studies.response", "studies.study", "waveguide.colours"),
+    *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.
 WITHIN = {"draw_batch", "linear_objective", "match_objective", "restored_objective", "drawn_error"}
