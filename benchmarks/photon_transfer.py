@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thincam_jax.measured import ExposedFrames, SensorCalibration, measure_sensor
+from thincam_jax.measured import measure_sensor
+from thincam_jax.measured.exposures import ExposedFrames
+from thincam_jax.measured.sensor import SensorCalibration
 
 PAGE = Path(__file__).parents[1] / "docs/measured/photon_transfer.md"
 SHAPE, FULL = (48, 64), 4095

@@ -21,7 +21,7 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).parent))
 from scipy_admm import ScipyAdmm
 
-from thincam_jax.reconstruction import Psfs, Recording
+from thincam_jax import Psfs, Recording
 from thincam_jax.reconstruction.admm import RELAXATION
 from thincam_jax.reconstruction.iterate import CHUNK, _advance_donated
 from thincam_jax.reconstruction.parallel import ParallelMethod, in_parallel

@@ -13,7 +13,7 @@ from test_prior import CASES, COUNT, PHOTOGRAPHS, SIDE
 
 import thincam_jax as tc
 from thincam_jax.imaging.metrics import align, psnr
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.learn.refocusing.sources import photographs
 
 NAMES = (
     "zone aperture, 100 mm",

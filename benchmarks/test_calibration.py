@@ -17,14 +17,14 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
-from thincam_jax.imaging.operators import Scaled
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.measured.calibration import (
     HadamardSeries,
     create_captures,
     open_captures,
     simulate_captures,
-    walsh_hadamard,
 )
+from thincam_jax.measured.calibration.hadamard import walsh_hadamard
 from thincam_jax.units import deg, nm, um
 
 CELLS, SHAPE, NOISE = (64, 64), (440, 440), 8.0

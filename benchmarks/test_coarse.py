@@ -9,7 +9,7 @@ from test_prior import PHOTOGRAPHS
 
 import thincam_jax as tc
 from thincam_jax.imaging.metrics import align, psnr
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.learn.refocusing.sources import photographs
 from thincam_jax.reconstruction.problem import forward
 
 SIDE = 512

@@ -25,8 +25,9 @@ from typer.testing import CliRunner
 
 import thincam_jax as tc
 from thincam_jax.commands import cli
-from thincam_jax.imaging.operators import CropConvolution, LowRank, Separable
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.imaging.operators import CropConvolution, Separable
+from thincam_jax.imaging.operators.low_rank import LowRank
+from thincam_jax.learn.refocusing.sources import photographs
 
 SHAPE, SIDE = (96, 128), 64
 COUNT = int(os.environ.get("THINCAM_CASES", "200"))

@@ -15,8 +15,9 @@ import skimage.data
 
 import thincam_jax as tc
 from benchmarks import test_public
+from thincam_jax.learn.denoiser.crops import Crops
 from thincam_jax.learn.denoiser.network import load_network
-from thincam_jax.learn.denoiser.train import Crops, loss
+from thincam_jax.learn.denoiser.train import loss
 from thincam_jax.units import nm, um
 
 SHAPE = (512, 512)

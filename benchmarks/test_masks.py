@@ -14,8 +14,8 @@ import pytest
 import scipy.special
 
 import thincam_jax as tc
+from thincam_jax.lensless import Path
 from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation import Path
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable
 

@@ -14,7 +14,7 @@ from test_background import score
 from test_prior import PHOTOGRAPHS
 
 import thincam_jax as tc
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.learn.refocusing.sources import photographs
 from thincam_jax.reconstruction import smooth_misfit
 from thincam_jax.reconstruction.problem import forward
 

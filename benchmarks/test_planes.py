@@ -23,7 +23,7 @@ import tifffile
 
 import thincam_jax as tc
 from thincam_jax._core.grids import block_sum
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.learn.refocusing.sources import photographs
 
 HAND = Path(os.environ.get("THINCAM_HAND", "../shared/data/diffusercam-hand"))
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))

@@ -30,7 +30,8 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Separable
 from thincam_jax.imaging.targets import middle_square, resize, sample_image, usaf1951
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.lensless.masks import maximum_length_sequence
 from thincam_jax.reconstruction.problem import brightness
 from thincam_jax.units import deg, nm, um
 
@@ -110,7 +111,7 @@ def mura(order, cell):
 
 
 def flatcam():
-    code = np.repeat(2.0 * tc.maximum_length_sequence(127) - 1, 3)
+    code = np.repeat(2.0 * maximum_length_sequence(127) - 1, 3)
     code = np.convolve(np.tile(code, 2), [0.25, 0.5, 0.25], "same")
     sides = [
         np.stack([code[3 * m : 3 * m + n] for m in range(count)], axis=1) / n**0.5

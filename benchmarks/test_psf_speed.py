@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless import Path
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable
 

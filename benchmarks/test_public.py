@@ -13,7 +13,8 @@ import pytest
 
 import thincam_jax as tc
 from benchmarks.test_flatcam import CHANNELS, FIELD, RHO, codes
-from thincam_jax.imaging.operators import CropConvolution, Separable, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution, Separable
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.separable import pixel_nodes

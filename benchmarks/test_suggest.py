@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from thincam_jax import design, learn
-from thincam_jax.learn.suggester_training import _examples
-from thincam_jax.learn.suggestions import refine
+from thincam_jax.learn.suggester_training import _examples, train_suggester
+from thincam_jax.learn.suggestions import propose, refine
 from thincam_jax.reconstruction import phase_pairs
 
 HELD_OUT = 200
@@ -80,7 +80,7 @@ def answers(kind):
     space, *data = problem(kind)
     start = time.perf_counter()
     model = design.ResponseModel(space, *data)
-    suggester = learn.train_suggester(model, key=jax.random.key(0)).suggester
+    suggester = train_suggester(model, key=jax.random.key(0)).suggester
     jax.block_until_ready(suggester)
     training = time.perf_counter() - start
     examples = _examples(model, 4096, jax.random.key(1))
@@ -91,7 +91,7 @@ def answers(kind):
     rows = []
     for name, target in zip(("attainable", "others"), targets(model), strict=True):
         alone, of_alone = each(lambda w: network_alone(suggester, w), target)
-        compiled, of_steps = each(lambda w: learn.propose(suggester, w), target)
+        compiled, of_steps = each(lambda w: propose(suggester, w), target)
         told, of_all = each(lambda w: learn.suggest(suggester, w), target)
         nearest, of_nearest = each(lambda w: nearest_sample(model, *examples, w), target)
         searched, of_search = each(search, target)
@@ -113,9 +113,7 @@ def test_suggest(benchmark, kind, capsys):
     with jax.enable_x64(False):
         training, suggester, rows = answers(kind)
         target = jnp.asarray(targets(suggester.model)[0][0])
-        benchmark.pedantic(
-            lambda: jax.block_until_ready(learn.propose(suggester, target)), rounds=50
-        )
+        benchmark.pedantic(lambda: jax.block_until_ready(propose(suggester, target)), rounds=50)
     with capsys.disabled():
         print(f"\n\n{kind}: trained in {training:.0f} s\n")
         print("| targets | by | time, ms | median, dB | 95 %, dB | within 1 dB |")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
+from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
 from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 
 SHAPE = (2048, 2048)

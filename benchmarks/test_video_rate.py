@@ -23,7 +23,7 @@ import skimage.data
 import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
+from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
 from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 from thincam_jax.units import nm, um
 

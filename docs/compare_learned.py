@@ -43,10 +43,11 @@ from score_refocusing import (
     two_planes,
 )
 
-from thincam_jax import learn
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.sources import drawn, photographs, samples
+from thincam_jax.learn.refocusing.train import Lessons
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.training import Task, train_model
+from thincam_jax.learn.training import Task, TrainingOptions, train_model
 from thincam_jax.learn.unrolled import Adam, UnrolledAdmm, train
 from thincam_jax.reconstruction.problem import InverseProblem
 
@@ -126,9 +127,9 @@ def _unrolled(model, problem):
     return model(problem)
 
 
-def untrained(seed: int) -> learn.RefocusNetwork:
-    options = learn.NetworkOptions(steps=2, widths=(32, 32, 32, 32))
-    return learn.RefocusNetwork.create(refocus_camera(PIXELS), options, key=seed)
+def untrained(seed: int) -> RefocusNetwork:
+    options = NetworkOptions(steps=2, widths=(32, 32, 32, 32))
+    return RefocusNetwork.create(refocus_camera(PIXELS), options, key=seed)
 
 
 def learned(lessons, options, known) -> dict[str, Callable]:
@@ -141,7 +142,7 @@ def learned(lessons, options, known) -> dict[str, Callable]:
     codes, networks = {}, {}
     for name, scenes in kinds.items():
         given, began = dataclasses.replace(lessons, scenes=scenes), time.process_time()
-        networks[f"network, {name}"] = Methods(learn.train(network, given, options).model).learned
+        networks[f"network, {name}"] = Methods(train_network(network, given, options).model).learned
         seconds = time.process_time() - began
         print(f"network, {name}: {seconds:.0f} s of CPU", flush=True)
         codes[f"code, {name}"] = Coded(given, network, options, seconds).focus
@@ -226,9 +227,9 @@ def main(images: str, tuned: str, count: int, pool: int, trainings) -> None:
     plain, tables = {"Wiener": methods.wiener, "ADMM-TV": methods.admm}, []
     # Compiled before any time is taken.
     source = samples(SIDE) + photographs(tuned, SIDE) + drawn(0, 40, SIDE)
-    lessons = learn.Lessons(source, pool=pool, held_out=drawn(1, 8, SIDE))
+    lessons = Lessons(source, pool=pool, held_out=drawn(1, 8, SIDE))
     short = dataclasses.replace(trainings[0], steps=2, check_every=1)
-    learn.train(methods.network, dataclasses.replace(lessons, pool=1), short)
+    train_network(methods.network, dataclasses.replace(lessons, pool=1), short)
     for options in trainings:
         runs = {**plain, **learned(lessons, options, known)}
         tables.append(table(camera, runs, pictures, count, options.seed))
@@ -239,5 +240,5 @@ if __name__ == "__main__":
     images, tuned, *more = sys.argv[1:]
     count, steps, pool, seeds = more + ["8", "4000", "120", "3"][len(more) :]
     told = {"steps": int(steps), "rate": 6e-4, "check_every": 300}
-    trainings = [learn.TrainingOptions(**told, seed=seed) for seed in range(int(seeds))]
+    trainings = [TrainingOptions(**told, seed=seed) for seed in range(int(seeds))]
     main(images, tuned, int(count), int(pool), trainings)

@@ -73,7 +73,7 @@ TOP = "thincam_jax"
 PACKAGES = (
     TOP,
     "thincam_jax.lensless",
-    "thincam_jax.lensless.propagation",
+    "thincam_jax.lensless.masks",
     "thincam_jax.imaging.targets",
     "thincam_jax.imaging.operators",
     "thincam_jax.imaging.metrics",
@@ -85,11 +85,65 @@ PACKAGES = (
     "thincam_jax.design",
     "thincam_jax.studies",
     "thincam_jax.learn",
-    "thincam_jax.learn.denoiser",
-    "thincam_jax.learn.refocusing",
     "thincam_jax.plot",
     "thincam_jax.hardware",
     "thincam_jax.hardware.virtual",
+)
+# Modules that scripts and pages use beyond these names; versions do not promise them.
+MODULES = (
+    "design.phase_mask",
+    "design.phase_retrieval",
+    "design.plate",
+    "design.relief_files",
+    "hardware.acquisition.plan",
+    "hardware.acquisition.taker",
+    "hardware.base",
+    "hardware.displays.phase_levels",
+    "hardware.virtual.optics",
+    "hardware.virtual.rig",
+    "imaging.metrics.mtf",
+    "imaging.metrics.usaf",
+    "imaging.operators.base",
+    "imaging.operators.crop_convolution",
+    "imaging.operators.low_rank",
+    "imaging.operators.masked",
+    "imaging.operators.separable",
+    "imaging.refractive_index",
+    "imaging.targets.images",
+    "imaging.targets.patterns",
+    "imaging.targets.usaf",
+    "learn.denoiser.pictures",
+    "learn.refocusing.cameras",
+    "learn.refocusing.network",
+    "learn.refocusing.scenes",
+    "learn.refocusing.sources",
+    "learn.refocusing.train",
+    "learn.refocusing.use",
+    "learn.suggester_training",
+    "learn.training",
+    "lensless.masks.display",
+    "lensless.masks.reliefs",
+    "lensless.phase_shift",
+    "lensless.propagation.angular_spectrum",
+    "measured.bayer",
+    "measured.calibration.hadamard",
+    "measured.calibration.screen_fit",
+    "measured.examination",
+    "measured.exposures",
+    "reconstruction.iterate",
+    "reconstruction.noise",
+    "reconstruction.problem",
+    "reconstruction.solver",
+    "studies.design",
+    "studies.mask_captures",
+    "studies.mask_comparison",
+    "studies.prepared",
+    "studies.psf_error_cost",
+    "waveguide.colours",
+    "waveguide.distance",
+    "waveguide.rays",
+    "waveguide.screen_to_sensor",
+    "waveguide.smear",
 )
 
 
@@ -148,12 +202,27 @@ def reference_page(package: str, seen: set[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def modules_page() -> str:
+    """Tables of what the modules define that versions do not promise."""
+    lines = ["Modules", "=======", "", "They may change without notice.", ""]
+    for name in MODULES:
+        names = [
+            node.name
+            for node in source(f"{TOP}.{name}").body
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name[0] != "_"
+        ]
+        lines += [name, "-" * len(name), "", first_line(f"{TOP}.{name}") + ".", ""]
+        lines += [f".. currentmodule:: {TOP}.{name}", "", ".. autosummary::", ""]
+        lines += [*(f"   {n}" for n in names), ""]
+    return "\n".join(lines)
+
+
 def write_reference(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     seen: set[tuple[str, str]] = set()
-    for package in PACKAGES:
-        page = folder / f"{package}.rst"
-        text = reference_page(package, seen)
+    pages = {package: reference_page(package, seen) for package in PACKAGES}
+    for name, text in {**pages, "modules": modules_page()}.items():
+        page = folder / f"{name}.rst"
         if not page.exists() or page.read_text("utf-8") != text:
             page.write_text(text, "utf-8")
 

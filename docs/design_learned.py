@@ -16,18 +16,19 @@ from refocusing_baselines import wiener
 from refocusing_scores import scores
 
 import thincam_jax as tc
-from thincam_jax import learn
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
-from thincam_jax.learn.refocusing.network import RefocusNetwork
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.scenes import SceneOptions, draw_batch
 from thincam_jax.learn.refocusing.sources import drawn
+from thincam_jax.learn.refocusing.train import Lessons, train
 from thincam_jax.learn.refocusing.use import read
-from thincam_jax.learn.training import Task, train_model
+from thincam_jax.learn.training import Task, TrainingOptions, train_model
 from thincam_jax.units import nm, um
 
 START, LEAST, MOST = (2.0, 5.0), (0.5, 3.0), (6.0, 9.0)  # β in rad/mm², d in mm
-OPTIONS = learn.NetworkOptions(steps=1, widths=(24, 32, 32))
+OPTIONS = NetworkOptions(steps=1, widths=(24, 32, 32))
 SCENES = SceneOptions(snr_db=(30.0, 30.0), poisson=0.0)
 
 
@@ -36,7 +37,7 @@ class Optics(eqx.Module):
 
     where: jax.Array
 
-    def camera(self, base) -> learn.RefocusCamera:
+    def camera(self, base) -> RefocusCamera:
         least, most = (jnp.log(jnp.asarray(x, self.where.dtype)) for x in (LEAST, MOST))
         beta, distance = jnp.exp(least + (most - least) * jax.nn.sigmoid(self.where))
         return at(base, beta, distance)
@@ -47,7 +48,7 @@ class Optics(eqx.Module):
         return Optics(jnp.asarray(np.log(part / (1 - part)), jnp.float32))
 
 
-def at(base, beta, distance) -> learn.RefocusCamera:
+def at(base, beta, distance) -> RefocusCamera:
     return eqx.tree_at(lambda c: (c.camera.mask.beta, c.camera.distance), base, (beta, distance))
 
 
@@ -79,11 +80,11 @@ def wiener_images(planes, batch, strength):
     return jax.vmap(one)(batch.capture, batch.deviation, batch.commanded)
 
 
-def base_camera() -> learn.RefocusCamera:
+def base_camera() -> RefocusCamera:
     """With the largest d, whose PSFs and blurs need the most pixels."""
     mask = tc.FresnelZoneAperture(beta=START[0], width=5.0)
     thin = tc.LenslessCamera(mask, tc.Sensor((64, 64), 176 * um), MOST[1])
-    return learn.RefocusCamera(thin, 532 * nm, field_shape=(32, 32), near=50.0, far=200.0, planes=5)
+    return RefocusCamera(thin, 532 * nm, field_shape=(32, 32), near=50.0, far=200.0, planes=5)
 
 
 def untrained(camera):
@@ -91,7 +92,7 @@ def untrained(camera):
 
 
 def found_optics(base, images, model, of, steps: int) -> Optics:
-    options = learn.TrainingOptions(steps=steps, rate=3e-3, check_every=steps)
+    options = TrainingOptions(steps=steps, rate=3e-3, check_every=steps)
     task = Task(lambda key: (base, images, key), of)
     # Nothing judges it: its optics move until the last step.
     state = train_model(task, model, options).state
@@ -102,10 +103,10 @@ def found_optics(base, images, model, of, steps: int) -> Optics:
 def judged(base, optics: Optics, source, steps: int) -> dict[str, float]:
     """A network trained for a camera, and the best Wiener filter, on scenes of unseen images."""
     camera = optics.camera(base)
-    lessons = learn.Lessons(source, SCENES, batch=2, pool=200)
+    lessons = Lessons(source, SCENES, batch=2, pool=200)
     network = RefocusNetwork(untrained(camera), Planes(camera), OPTIONS)
-    options = learn.TrainingOptions(steps=steps, rate=1e-3, check_every=max(1, steps // 5))
-    network = learn.train(network, lessons, options).model
+    options = TrainingOptions(steps=steps, rate=1e-3, check_every=max(1, steps // 5))
+    network = train(network, lessons, options).model
     batch = draw_batch(jax.random.key(77), drawn(9, 16, 64).images, camera, SCENES, 48)
     found = read(network, batch.capture, batch.commanded[:, None], batch.deviation).images[:, 0]
     strengths = [

@@ -22,6 +22,14 @@ from matplotlib.figure import Figure
 
 import thincam_jax as tc
 from thincam_jax import design
+from thincam_jax.design.landscape import evaluate_grid
+from thincam_jax.design.match import ring_levels
+from thincam_jax.design.objectives import bayes_error, channels
+from thincam_jax.lensless.masks import (
+    UniformlyRedundantArray,
+    maximum_length_sequence,
+    random_cells,
+)
 from thincam_jax.reconstruction import phase_pairs
 from thincam_jax.units import nm, um
 
@@ -77,7 +85,7 @@ def _two_pitches():
 
 
 def _expected_error(chosen, data):
-    return design.bayes_error(design.channels(chosen, *data))
+    return bayes_error(channels(chosen, *data))
 
 
 def _decibels(error):
@@ -89,7 +97,7 @@ def design_landscape():
     space, *data = _two_pitches()
     count, (low, high) = 57, (8.0, 36.0)
     data = (*data, design.Polar(290.0, 128, 2))
-    _, error = design.evaluate_grid(_expected_error, space, data, count)
+    _, error = evaluate_grid(_expected_error, space, data, count)
     level = _decibels(error / jnp.nanmin(error)).reshape(count, count)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     ax = figure.subplots()
@@ -116,7 +124,7 @@ def design_front():
     for distance in distances:
         thesis = eqx.tree_at(lambda d: d.distance, space.base, jnp.full(4, distance))
         moved = design.DesignSpace(thesis, space.variables)
-        _, found = design.evaluate_grid(_expected_error, moved, data, 29)
+        _, found = evaluate_grid(_expected_error, moved, data, 29)
         levels.append([_decibels(_expected_error(thesis, data)), _decibels(np.nanmin(found))])
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     ax = figure.subplots()
@@ -134,21 +142,21 @@ def suggest():
     hidden = design.shots(
         jnp.array([17.0, 12.5]), 6.5, (0.0, 1.5 * jnp.pi), wavelength=500 * nm, width=5.632
     )
-    wanted = design.ring_levels(design.channels(hidden, *data, rings), rings, 32)
+    wanted = ring_levels(channels(hidden, *data, rings), rings, 32)
     best = design.match_response(
         design.ResponseModel(space, *data, rings), wanted, key=jax.random.key(1)
     )
-    thesis = design.channels(space.base, *data, rings)
+    thesis = channels(space.base, *data, rings)
     figure = Figure(figsize=(6.4, 3.4), layout="constrained")
     ax = figure.subplots()
     cycles = (np.arange(32) + 0.5) * 96.0 / 32
     ax.plot(cycles, wanted, "k--", label="wanted (of β 17 and 12.5 rad/mm²)", lw=3)
     found = best.found[0].design
     first, second = (float(found.beta[n]) for n in (0, 2))
-    found = design.channels(found, *data, rings)
+    found = channels(found, *data, rings)
     name = f"found: β {first:.1f} and {second:.1f} rad/mm²"
-    ax.plot(cycles, design.ring_levels(found, rings, 32), "k-", label=name, lw=1)
-    levels = design.ring_levels(thesis, rings, 32)
+    ax.plot(cycles, ring_levels(found, rings, 32), "k-", label=name, lw=1)
+    levels = ring_levels(thesis, rings, 32)
     ax.plot(cycles, levels, color="0.6", label="the thesis' pair, 25 and 21 rad/mm²")
     ax.set(xlabel="frequency (cycles/rad)", ylabel="level (dB)", ylim=(0, None))
     ax.legend()
@@ -193,14 +201,14 @@ def _by_command(picture: str, command: str, config: str, *options: str) -> Path:
 
 def masks():
     """A contact sheet: masks 1.5 mm wide, and the PSF of each 2 mm behind it."""
-    code = tc.maximum_length_sequence(31)
+    code = maximum_length_sequence(31)
     rings = np.random.default_rng(4).integers(0, 2, 24)
     sheet = {
         "Fresnel zone aperture": tc.FresnelZoneAperture(80.0, width=1.5),
         "MURA, 29": tc.ModifiedUniformlyRedundantArray(29, 1.5 / 29),
-        "URA, 31 × 29": tc.UniformlyRedundantArray((31, 29), 1.5 / 31),
+        "URA, 31 × 29": UniformlyRedundantArray((31, 29), 1.5 / 31),
         "code of 31, xor": tc.SeparableMask(code, code, 1.5 / 31, combine="xor"),
-        "random cells": tc.random_cells(jax.random.key(0), 1.5, 0.05),
+        "random cells": random_cells(jax.random.key(0), 1.5, 0.05),
         "pinhole": tc.Pinhole(50 * um),
         "lenslets, f = 2 mm": tc.LensletArray(2.0, 1.5 / 8, (8, 8)),
         "rings": tc.RadialMask(rings, 0.75 / 24),

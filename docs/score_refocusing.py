@@ -28,6 +28,7 @@ from scipy import ndimage
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.scenes import captured
 from thincam_jax.learn.refocusing.sources import photographs
@@ -38,12 +39,12 @@ NEAR, FAR, SNR = 60.0, 120.0, 30.0
 SEEDS = (0, 1000, 2000)  # added to the noise's
 
 
-def refocus_camera(pixels: int = 256) -> learn.RefocusCamera:
+def refocus_camera(pixels: int = 256) -> RefocusCamera:
     """The camera of configs/learned_refocus.yaml, its sensor divided into so many pixels."""
     mask = tc.FresnelZoneAperture(beta=13.0, width=5.6)
     sensor = tc.Sensor((pixels, pixels), 256 * 44 * um / pixels)
     thin, shape = tc.LenslessCamera(mask, sensor, distance=7.5), (pixels // 2, pixels // 2)
-    return learn.RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=7)
+    return RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=7)
 
 
 class Shot(NamedTuple):

@@ -16,6 +16,7 @@ from thincam_jax import learn
 from thincam_jax.learn.checkpoint import read_description
 from thincam_jax.learn.denoiser.network import load_network, network_description, save_network
 from thincam_jax.learn.refocusing import store
+from thincam_jax.learn.refocusing.store import save
 
 ROOM = Path(__file__).parents[1] / "thincam_jax/learn"
 
@@ -29,7 +30,7 @@ if read_description(path)["kind"] == "refocusing network":
     place = ROOM / "refocusing/shipped.thincam"
     network = learn.load(path, refocus_camera())
     half = eqx.tree_at(lambda n: n.weights, network, halved(network.weights))
-    learn.save(place, half, store.network_description(path)["training"])
+    save(place, half, store.network_description(path)["training"])
 else:
     place = ROOM / "denoiser/shipped.thincam"
     save_network(place, halved(load_network(path)), network_description(path)["training"])

@@ -31,14 +31,16 @@ from score_refocusing import (
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.targets import siemens_star
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.reconstruction.depth.refocus import axial_resolution
 from thincam_jax.units import nm, um
 
 THESIS = (160.0, 200.0)  # mm
 
 
-def thesis_camera(pixels: int) -> learn.RefocusCamera:
+def thesis_camera(pixels: int) -> RefocusCamera:
     """A mask of 2.15 mm before a sensor of 2048 × 2.4 µm, in so many pixels.
 
     The mask is not an aperture of zones; here it is one, as fine as the pixels carry.
@@ -47,10 +49,10 @@ def thesis_camera(pixels: int) -> learn.RefocusCamera:
     mask = tc.FresnelZoneAperture(beta=np.pi / (2.15 * pitch), width=2.15)
     thin = tc.LenslessCamera(mask, tc.Sensor((pixels, pixels), pitch), distance=2.5)
     shape = (pixels // 2, pixels // 2)
-    return learn.RefocusCamera(thin, 500 * nm, field_shape=shape, near=150.0, far=210.0, planes=2)
+    return RefocusCamera(thin, 500 * nm, field_shape=shape, near=150.0, far=210.0, planes=2)
 
 
-def optics(camera: learn.RefocusCamera, distances) -> dict[str, float]:
+def optics(camera: RefocusCamera, distances) -> dict[str, float]:
     """How much two distances differ to a camera.
 
     The depth of focus at the nearer one, mm; by how many pixels the mask's shadow is wider; and
@@ -91,8 +93,8 @@ def table(camera, runs: dict[str, Callable], pictures, count: int, distances, sn
 
 
 def baselines(camera) -> Methods:
-    options = learn.NetworkOptions(steps=1, widths=(4,))
-    return Methods(learn.RefocusNetwork.create(camera, options, key=jax.random.key(0)))
+    options = NetworkOptions(steps=1, widths=(4,))
+    return Methods(RefocusNetwork.create(camera, options, key=jax.random.key(0)))
 
 
 def main(images: str, tuned: str, count: int) -> None:

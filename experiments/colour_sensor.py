@@ -14,9 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax import measured
 from thincam_jax.imaging.metrics import align, psnr
 from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.measured.bayer import demosaic
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in seconds
@@ -69,7 +69,7 @@ full = rng.poisson(electrons * clean / clean.mean()) * (clean.mean() / electrons
 
 mosaic = full[1].copy()
 mosaic[:, ::2, ::2], mosaic[:, 1::2, 1::2] = full[0, :, ::2, ::2], full[2, :, 1::2, 1::2]
-interpolated = np.stack([measured.demosaic(frame, "RGGB") for frame in mosaic])
+interpolated = np.stack([demosaic(frame, "RGGB") for frame in mosaic])
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
 for ax, part in zip(axes, (mosaic[0], mosaic[0, :24, :32]), strict=True):

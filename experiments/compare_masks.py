@@ -16,10 +16,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.design import contour_target, mask_of_phase, one_turn, retrieve_phase
-from thincam_jax.imaging.targets import middle_square, point_grid, sample_image
-from thincam_jax.lensless.propagation import Path as LightPath
-from thincam_jax.studies import ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
+from thincam_jax.design.phase_mask import mask_of_phase, one_turn
+from thincam_jax.design.phase_retrieval import contour_target, retrieve_phase
+from thincam_jax.imaging.targets import middle_square, sample_image
+from thincam_jax.imaging.targets.patterns import point_grid
+from thincam_jax.lensless import Path as LightPath
+from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence, random_cells
+from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.studies.mask_captures import ComparedMask, Setting
+from thincam_jax.studies.mask_comparison import ComparedScene, MaskComparison, Tuning
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": large pixels, in seconds
@@ -47,8 +52,8 @@ setting = Setting(tc.Sensor((pixels, pixels), pitch), distance, field, width)
 # the photons of one.
 
 key, cells = jax.random.key(0), 24 * um
-fine, coarse = tc.MaskBlank((372, 372), 2 * um, 1.52), tc.MaskBlank((186, 186), 4 * um, 1.52)
-code = tc.maximum_length_sequence(31)
+fine, coarse = MaskBlank((372, 372), 2 * um, 1.52), MaskBlank((186, 186), 4 * um, 1.52)
+code = maximum_length_sequence(31)
 
 
 def contours():
@@ -64,17 +69,17 @@ def zone_plate(phase=0.0, profile="cosine"):
 
 lenses = {
     "9 lenslets": tc.LensletArray(2.0, 248 * um, (3, 3)),
-    "Voronoi-Fresnel": tc.voronoi_fresnel(key, fine, sites=9, focal_length=2.0, wavelength=green),
+    "Voronoi-Fresnel": voronoi_fresnel(key, fine, sites=9, focal_length=2.0, wavelength=green),
 }
 reliefs = {
     "contours": contours(),
-    "diffuser": tc.diffuser(key, fine, correlation_length=40 * um, rms_slope=0.016),
+    "diffuser": diffuser(key, fine, correlation_length=40 * um, rms_slope=0.016),
 }
 openings = {
     "MURA": tc.ModifiedUniformlyRedundantArray(31, cells),
     "FlatCam product": tc.SeparableMask(code, code, cells, combine="product"),
     "FlatCam xor": tc.SeparableMask(code, code, cells, combine="xor"),
-    "random cells": tc.random_cells(key, width, cells),
+    "random cells": random_cells(key, width, cells),
 }
 zones = {"zone plate": zone_plate(), "binary zone plate": zone_plate(profile="binary")}
 masks = {}

@@ -23,8 +23,8 @@ from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 
 from thincam_jax import learn
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.learn.denoiser import drawn
-from thincam_jax.learn.refocusing import photographs
+from thincam_jax.learn.denoiser.pictures import drawn
+from thincam_jax.learn.refocusing.sources import photographs
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": few small drawn scenes, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "denoiser"

@@ -22,8 +22,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.imaging.metrics import align, resolved_element, usaf_contrast
-from thincam_jax.imaging.targets import line_pair, resize, sample_image, usaf1951, usaf1951_elements
+from thincam_jax.imaging.metrics import align
+from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
+from thincam_jax.imaging.targets import resize, sample_image, usaf1951
+from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.reconstruction import fringe_scanning, phase_pairs
 from thincam_jax.units import nm
 

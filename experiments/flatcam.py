@@ -19,8 +19,9 @@ import numpy as np
 
 import thincam_jax as tc
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import centred
+from thincam_jax.imaging.operators.separable import centred
 from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.lensless.masks import maximum_length_sequence
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
@@ -39,7 +40,7 @@ length, pixels, pitch = (255, (500, 620), 8 * um) if full else (63, (84, 100), 1
 scene_shape, scene_pitch = ((96, 128), 20 * um) if full else ((18, 24), 24 * um)  # as projected
 colours = tc.Spectrum(np.linspace(400, 700, 7 if full else 2) * nm)
 object_distance = 250.0
-code = tc.maximum_length_sequence(length)
+code = maximum_length_sequence(length)
 
 
 def camera(combine, distance):

@@ -23,8 +23,9 @@ from jax.scipy.fft import dctn, idctn
 from jax.scipy.sparse.linalg import cg
 
 import thincam_jax as tc
-from thincam_jax.imaging.operators import kernel_grid
-from thincam_jax.imaging.targets import resize, sample_image, sample_images
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.units import nm
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds

@@ -20,6 +20,7 @@ import scipy.optimize
 
 import thincam_jax as tc
 from thincam_jax.imaging.targets import siemens_star
+from thincam_jax.reconstruction import solve_fixed_point
 from thincam_jax.units import nm, um
 
 SMALL = os.environ.get("THINCAM_SIZE") == "small"
@@ -67,7 +68,7 @@ print(f"signal to noise {20 * math.log10(float(jnp.std(clean)) / NOISE):.1f} dB"
 
 def image_of(numbers):
     problem = problem_of(numbers[0], jnp.exp(numbers[1]), seen)
-    return tc.solve_fixed_point(problem, 0 * chart, iterations=100, tolerance=1e-6).image
+    return solve_fixed_point(problem, 0 * chart, iterations=100, tolerance=1e-6).image
 
 
 @jax.jit

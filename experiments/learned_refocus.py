@@ -26,7 +26,13 @@ import PIL.Image
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.learn.refocusing import SceneOptions, draw_batch, drawn, read
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.scenes import SceneOptions, draw_batch
+from thincam_jax.learn.refocusing.sources import drawn
+from thincam_jax.learn.refocusing.train import Lessons, train
+from thincam_jax.learn.refocusing.use import read
+from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.reconstruction.depth import refocus_distances
 from thincam_jax.units import nm, um
 
@@ -48,9 +54,9 @@ planes, widths = {"full": (5, (16, 24, 32)), "small": (2, (4, 4))}[SIZE]
 aperture = tc.FresnelZoneAperture(beta=13.0, width=width)
 thin = tc.LenslessCamera(aperture, tc.Sensor((pixels, pixels), 44 * um), distance=7.5)
 shape = (pixels // 2, pixels // 2)
-camera = learn.RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=planes)
-options = learn.NetworkOptions(steps=2 if SIZE == "full" else 1, widths=widths)
-untrained = learn.RefocusNetwork.create(camera, options, key=jax.random.key(0))
+camera = RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=planes)
+options = NetworkOptions(steps=2 if SIZE == "full" else 1, widths=widths)
+untrained = RefocusNetwork.create(camera, options, key=jax.random.key(0))
 
 # %%
 # Training
@@ -64,12 +70,12 @@ source, unseen = drawn(0, 64 if SIZE == "full" else 4, 2 * pixels), drawn(1, 8, 
 two = SceneOptions(layers=(0.0, 1.0, 0.0), dark=0.0, relief=0.0, snr_db=(30.0, 30.0), poisson=0.0)
 kinds = SceneOptions() if SIZE == "full" else two
 pool = 100 if SIZE == "full" else 2  # pairs of scenes
-lessons = learn.Lessons(source, kinds, batch=2, pool=pool, judged=1, held_out=unseen)
-training = learn.TrainingOptions(steps=steps, rate=1e-3, check_every=max(2, steps // 10))
+lessons = Lessons(source, kinds, batch=2, pool=pool, judged=1, held_out=unseen)
+training = TrainingOptions(steps=steps, rate=1e-3, check_every=max(2, steps // 10))
 if NETWORK.exists():
     network, state = learn.load(NETWORK, camera), None
 else:
-    trained = learn.train(untrained, lessons, training, folder=FIGURES)
+    trained = train(untrained, lessons, training, folder=FIGURES)
     network, state = trained.model, trained.state
 
 # %%
@@ -144,9 +150,7 @@ for error in errors:
     other = tc.LenslessCamera(
         tc.FresnelZoneAperture(beta=13.0 * (1 + error), width=width), thin.sensor, 7.5
     )
-    seen = learn.RefocusCamera(
-        other, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=planes
-    )
+    seen = RefocusCamera(other, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=planes)
     # The same scene and the same noise through another mask.
     taken = draw_batch(jax.random.key(5), jnp.asarray(unseen.images), seen, two, 2)
     one = read(network, taken.capture, distances, taken.deviation)

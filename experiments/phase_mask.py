@@ -19,26 +19,24 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.design import (
+from thincam_jax.design import PhotonNoise, PowerLaw, Setup
+from thincam_jax.design.phase_mask import (
     MaskSetting,
-    PhotonNoise,
-    PowerLaw,
-    Setup,
-    contour_target,
     cropped_error,
     linear_objective,
     mask_of_phase,
     one_turn,
     refine_mask,
-    retrieve_phase,
-    write_height_map,
-    write_stl,
 )
+from thincam_jax.design.phase_retrieval import contour_target, retrieve_phase
+from thincam_jax.design.relief_files import write_height_map, write_stl
 from thincam_jax.imaging.metrics import psnr
+from thincam_jax.imaging.refractive_index import CauchyIndex, ConstantIndex
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.lensless.propagation import Path as LightPath
+from thincam_jax.lensless import Path as LightPath
+from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
-from thincam_jax.waveguide import CauchyIndex, ConstantIndex
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "phase_mask"
@@ -62,7 +60,7 @@ pixels, across, steps, rounds = {"full": ((32, 40), 26, 60, 60), "small": ((16, 
 pitch, cell, distance, green = 6 * um, 2 * um, 2.0, 532 * nm
 polymer = CauchyIndex(1.504, 0.0042e-6)
 cells = (3 * pixels[0], 3 * pixels[1])
-blank = tc.MaskBlank(cells, cell, polymer)
+blank = MaskBlank(cells, cell, polymer)
 sensor = tc.Sensor(pixels, pitch)
 height, width = cells[0] * cell, cells[1] * cell
 object_distance = 300.0
@@ -120,8 +118,8 @@ without_crop = refine_mask(
 lenses = max(3, round(height * width / 0.15**2))
 focal_length = 1 / (1 / distance + 1 / object_distance)
 masks = {
-    "diffuser": tc.diffuser(keys[3], blank, correlation_length=40 * um, rms_slope=0.024),
-    "Voronoi-Fresnel": tc.voronoi_fresnel(
+    "diffuser": diffuser(keys[3], blank, correlation_length=40 * um, rms_slope=0.024),
+    "Voronoi-Fresnel": voronoi_fresnel(
         keys[3], blank, sites=lenses, focal_length=focal_length, wavelength=green
     ),
     "contours": by_retrieval,

@@ -18,7 +18,8 @@ import PIL.Image
 import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.imaging.targets import sample_image
-from thincam_jax.studies import pixel_noise, reconstruct_prepared
+from thincam_jax.lensless.masks import random_cells
+from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
 from thincam_jax.units import nm, um
 
 SMALL = os.environ.get("THINCAM_SIZE") == "small"
@@ -50,7 +51,7 @@ if hand := os.environ.get("THINCAM_HAND"):
     shadow = 1.0
 else:
     shape, pitch = ((160, 200), 12 * um) if SMALL else ((480, 600), 4 * um)
-    camera = tc.LenslessCamera(tc.random_cells(0, 1.2, 60 * um), tc.Sensor(shape, pitch), 2.0)
+    camera = tc.LenslessCamera(random_cells(0, 1.2, 60 * um), tc.Sensor(shape, pitch), 2.0)
     picture = np.moveaxis(sample_image("chelsea", linear=True), -1, 0)
     planes = [tc.ImagePlane(colour, distance=250.0, width=240.0) for colour in picture]
     light = [610 * nm, 540 * nm, 460 * nm]

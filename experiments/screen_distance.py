@@ -19,6 +19,7 @@ import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.distance import DistanceStatus
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "screen_distance"
@@ -81,7 +82,7 @@ ax = axes["p"]
 styles = [("0.0", "-"), ("0.0", "--"), ("0.0", ":"), ("0.6", "-")]
 for (grey, dashes), (name, one) in zip(styles, found.items(), strict=True):
     label = f"{name}: {one.distance:.0f} ± {one.standard_error:.0f} mm"
-    if one.status != wg.DistanceStatus.DETERMINED:
+    if one.status != DistanceStatus.DETERMINED:
         label = f"{name}: not determined"
     ax.plot(one.distances, one.log_likelihood, color=grey, linestyle=dashes, label=label)
 ax.set(xscale="log", xlabel="distance d2 (mm)", ylabel="log-likelihood, relative to the highest")
@@ -126,10 +127,10 @@ figure.savefig(FIGURES / "blinds.png", dpi=110)
 #
 # The error grows with the square of the distance, from 1 mm at 300 mm to about 12 mm at 900 mm.
 
-determined = [n for n, one in found.items() if one.status == wg.DistanceStatus.DETERMINED]
+determined = [n for n, one in found.items() if one.status == DistanceStatus.DETERMINED]
 assert len(determined) >= {"full": 3, "small": 2}[SIZE]
 for name in determined:
     one = found[name]
     assert abs(one.distance - scenes[name][1]) < 4 * one.standard_error
 assert "blank wall" not in determined
-assert repeated.status != wg.DistanceStatus.DETERMINED
+assert repeated.status != DistanceStatus.DETERMINED

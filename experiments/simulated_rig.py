@@ -19,18 +19,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.hardware import (
-    CameraSettings,
-    Procedure,
-    acquire,
-    method_b,
-    read_acquisition,
-    zone_plate,
-)
-from thincam_jax.hardware.virtual import Electronics, ModulatorOptics, VirtualRig
+from thincam_jax.hardware import CameraSettings, acquire, read_acquisition
+from thincam_jax.hardware.acquisition.plan import method_b, zone_plate
+from thincam_jax.hardware.acquisition.taker import Procedure
+from thincam_jax.hardware.virtual import VirtualRig
+from thincam_jax.hardware.virtual.optics import ModulatorOptics
+from thincam_jax.hardware.virtual.rig import Electronics
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.targets import sample_image
-from thincam_jax.reconstruction import estimate_noise, phase_pairs
+from thincam_jax.reconstruction import phase_pairs
+from thincam_jax.reconstruction.noise import estimate_noise
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in seconds

@@ -20,9 +20,12 @@ import numpy as np
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid, low_rank_psf
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.screen_to_sensor import ghost_images, ghost_psfs
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer and larger pixels
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "stis_camera"
@@ -62,7 +65,7 @@ camera = wg.SeeThroughCamera(screen, sensor, distance, gap)
 # mrad from the image, 36 pixels of 5.5 µm. (A pixel sees points 18.2 mm apart, 32 mrad at the
 # image's distance; but the ghost's is 600 mm, not 567.)
 
-axis = wg.ghost_images(camera, jnp.zeros((1, 2)), far, orders)
+axis = ghost_images(camera, jnp.zeros((1, 2)), far, orders)
 places, sources = np.asarray(axis.places)[:, 0, 1], np.asarray(axis.distance)[:, 0]
 apart = 1e3 * (places[1] - places[0]) / distance
 print(f"first ghost {apart:.1f} mrad away, sources at {np.round(sources)} mm")
@@ -116,7 +119,7 @@ def shadow(mask_at, sensor, grid, wavelength, source, place):
 
 grid = kernel_grid(sensor.grid, field)
 zone_plate = partial(shadow, plate, sensor, grid)
-own = wg.ghost_psfs(jax.tree.map(lambda part: part[:, None], axis), zone_plate)  # all orders
+own = ghost_psfs(jax.tree.map(lambda part: part[:, None], axis), zone_plate)  # all orders
 figure, axes = plt.subplots(1, orders, figsize=(13, 3.4), layout="constrained")
 half = grid.shape[0] / 2 * float(pitch)
 weights = np.asarray(axis.weight)[:, 0]
@@ -170,7 +173,7 @@ def superposed(images, values, mask_psf):
     def add(total, point):
         image, value, corner = point
         one = jax.tree.map(lambda part: part[:, None], image)
-        psf = wg.ghost_psfs(one, mask_psf)[0]
+        psf = ghost_psfs(one, mask_psf)[0]
         seen = jax.lax.dynamic_slice(psf, tuple(corner), (count, count))
         return total + value[:, None, None] * seen, None
 
@@ -182,12 +185,12 @@ def superposed(images, values, mask_psf):
 
 def models(mask_psf, object_distance):
     """What the camera is taken for, and the level of its PSFs."""
-    few = wg.ghost_images(camera, field_points(field, points), object_distance, orders)
+    few = ghost_images(camera, field_points(field, points), object_distance, orders)
     middle = points // 2
     level = few.weight[:, middle, middle].sum()
-    psfs = wg.ghost_psfs(few, mask_psf) / level
+    psfs = ghost_psfs(few, mask_psf) / level
     first = jax.tree.map(lambda part: part[:1, middle, middle], few)
-    alone = wg.ghost_psfs(first, mask_psf) / level
+    alone = ghost_psfs(first, mask_psf) / level
     fit = low_rank_psf(psfs, pitch, sensor.shape, field, tolerance=1e-2)
     errors = f"{fit.truncation_error:.1e} and {fit.interpolation_error:.1e}"
     print(f"{fit.operator.weights.shape[0]} convolutions, errors {errors}")
@@ -206,7 +209,7 @@ scenes = jnp.asarray(np.stack([resize(p, field) for p in pictures])[:, ::-1, ::-
 
 def captured(mask_psf, object_distance, level):
     """Without noise, from every point of the field."""
-    every = wg.ghost_images(camera, field_points(field, field[0]), object_distance, orders)
+    every = ghost_images(camera, field_points(field, field[0]), object_distance, orders)
     return superposed(every, scenes.reshape(len(scenes), -1), mask_psf) / level
 
 

@@ -26,6 +26,9 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.colours import colour_system
+from thincam_jax.waveguide.rays import pixel_centres
+from thincam_jax.waveguide.smear import trace_band
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_camera"
@@ -93,7 +96,7 @@ figure.savefig(FIGURES / "rays.png", dpi=110)
 # Each pixel is reached by the one colour that meets the Bragg condition for its direction, and the
 # ghosts' distance on the object varies too: no convolution describes this camera.
 
-pixels = wg.pixel_centres(camera)
+pixels = pixel_centres(camera)
 rays = wg.trace(camera, pixels, distance, orders)
 colours = np.asarray(rays.wavelength) / nm
 shifts = np.asarray(rays.points[1] - rays.points[0])[..., 1]
@@ -119,7 +122,7 @@ figure.savefig(FIGURES / "field.png", dpi=110)
 # lobes of the band show in it. Grey is what a pixel sees.
 
 middle = wg.trace(camera, jnp.zeros((1, 2)), distance, 3)
-band = wg.trace_band(camera, jnp.zeros((1, 2)), distance, 3, 2048)
+band = trace_band(camera, jnp.zeros((1, 2)), distance, 3, 2048)
 pixel_seen = 4.8e-3 * binned * (10.0 + distance) / 6.0
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
 for order, ax in enumerate(axes):
@@ -200,7 +203,7 @@ cameras = [
 bands = [wg.ColourBand(centre, 80 * nm) for centre in (610 * nm, 535 * nm, 465 * nm)]
 colour = wg.ColourCamera(cameras, bands)
 cells = wg.ObjectPlane((24, 24), distance, 150.0, (0.0, 27.0))
-mixed, separated = (wg.colour_system(colour, cells, orders, 4, kind) for kind in ("all", "none"))
+mixed, separated = (colour_system(colour, cells, orders, 4, kind) for kind in ("all", "none"))
 face = np.moveaxis(resize(sample_image("astronaut", linear=True), (24, 24)), -1, 0)[:, None]
 clean = mixed(jnp.asarray(face, jnp.float32))
 deviation = float(jnp.sqrt(jnp.mean(clean**2))) * 10 ** (-40 / 20)

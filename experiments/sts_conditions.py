@@ -22,7 +22,7 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.imaging.targets import middle_square, resize, sample_image, siemens_star
-from thincam_jax.measured import calibration as cal
+from thincam_jax.measured.calibration.hadamard import hadamard_pattern, walsh_hadamard
 from thincam_jax.units import deg, nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer cells and pixels, in seconds
@@ -87,7 +87,7 @@ sensor = tc.Sensor((pixels, pixels), 19.2 * um * 112 / pixels)
 camera = wg.SeeThroughCamera(wg.Screen(film, 5.0, 1.5, *outlines), sensor, 6.0, 10.0)
 radius = np.hypot(*np.meshgrid(*[np.linspace(-1, 1, pixels, dtype=np.float32)] * 2)) / 1.4142
 numbers, shape = range(cells**2), (cells, cells)
-patterns = np.stack([cal.hadamard_pattern(n, shape, "natural") > 0 for n in numbers])
+patterns = np.stack([hadamard_pattern(n, shape, "natural") > 0 for n in numbers])
 
 
 @functools.cache
@@ -115,7 +115,7 @@ def reconstructed(setup):
     """By conjugate gradients and ADMM-TV; H = V'U'ᵀ/N with v' = 2v − v₀, thesis Eq 5.13–5.17."""
     mixed = (1 - setup.left) * patterns + setup.left * np.roll(patterns, 1, axis=0)
     taken = frames(setup, rays(), mixed, np.random.default_rng(0))
-    matrix = cal.walsh_hadamard(2 * taken - taken[0]) / cells**2
+    matrix = walsh_hadamard(2 * taken - taken[0]) / cells**2
     shown = setup.light * pictures(cells, setup.grey_edges) ** setup.gamma
     taken = frames(setup, rays(setup.shift, setup.nearer), shown, np.random.default_rng(1))
     gram, pulled = (matrix.T @ matrix).astype(float), (taken @ matrix).astype(float)

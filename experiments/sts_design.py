@@ -19,8 +19,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax import design
 from thincam_jax import waveguide as wg
+from thincam_jax.design.plate import (
+    Plate,
+    PlateLimits,
+    Viewing,
+    find_plate,
+    judge_plate,
+    noise_variance,
+)
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.units import deg, um
@@ -40,10 +47,9 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 full = SIZE == "full"
 sensor = tc.Sensor((440, 440), 4.8 * um) if full else tc.Sensor((44, 44), 48 * um)
 cells = (64, 64) if full else (16, 16)
-viewing = design.Viewing(sensor, 550.0, 150.0, cell=150.0 / cells[1], snr_db=30.0)
-limits = design.PlateLimits(
-    design.Plate(5.0, 45 * deg, 8 * um, 0.005, 8.0, 6.0),
-    design.Plate(5.0, 70 * deg, 25 * um, 0.03, 20.0, 6.0),
+viewing = Viewing(sensor, 550.0, 150.0, cell=150.0 / cells[1], snr_db=30.0)
+limits = PlateLimits(
+    Plate(5.0, 45 * deg, 8 * um, 0.005, 8.0, 6.0), Plate(5.0, 70 * deg, 25 * um, 0.03, 20.0, 6.0)
 )
 counts = {"starts": 3, "samples": 64, "steps": 40} if full else {"samples": 16, "steps": 8}
 counts = counts if full else counts | {"starts": 1}
@@ -58,11 +64,11 @@ numbers = {  # unit and label of each
 
 
 def find(limits):
-    return design.find_plate(viewing, limits, key=jax.random.key(0), **counts)
+    return find_plate(viewing, limits, key=jax.random.key(0), **counts)
 
 
-plates = {"default": design.Plate(), "found": find(limits).plate}
-worth = {name: design.judge_plate(plate, viewing) for name, plate in plates.items()}
+plates = {"default": Plate(), "found": find(limits).plate}
+worth = {name: judge_plate(plate, viewing) for name, plate in plates.items()}
 for name, plate in plates.items():
     values = (f"{text} {getattr(plate, n) / unit:.4g}" for n, (unit, text) in numbers.items())
     print(f"{name}: error {worth[name].error:.2e}; {'; '.join(values)}")
@@ -94,7 +100,7 @@ print(sections)
 
 
 def error(plate, number, value):
-    return float(design.judge_plate(replace(plate, **{number: value}), viewing).error)
+    return float(judge_plate(replace(plate, **{number: value}), viewing).error)
 
 
 free = [n for n in numbers if getattr(limits.lower, n) < getattr(limits.upper, n)]
@@ -138,7 +144,7 @@ for name, plate in plates.items():
     plane = wg.ObjectPlane(cells, viewing.object_distance, viewing.object_width, middle)
     system = wg.system_operator(camera, plane, 4, 6)
     light = worth[name].light
-    variance = design.noise_variance(viewing, light) / light**2
+    variance = noise_variance(viewing, light) / light**2
     clean = system(jnp.asarray(images["scene"], light.dtype))
     drawn = jax.random.normal(jax.random.key(0), clean.shape, clean.dtype)
     captures = clean + jnp.sqrt(variance) * drawn
@@ -189,8 +195,8 @@ figure.savefig(FIGURES / "plates.png", dpi=110)
 front = []
 for focal in (10.0, 8.0, 6.0, 5.0, 4.0, 3.0) if full else (8.0, 4.0):
     ends = [replace(end, focal_distance=focal) for end in (limits.lower, limits.upper)]
-    default = design.judge_plate(design.Plate(focal_distance=focal), viewing)
-    found = find(design.PlateLimits(*ends)).error
+    default = judge_plate(Plate(focal_distance=focal), viewing)
+    found = find(PlateLimits(*ends)).error
     front.append((float(default.field_of_view) / deg, float(default.error), found))
 fields, default_errors, found_errors = zip(*front, strict=True)
 figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")

@@ -24,7 +24,8 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Sparse
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.measured.calibration import GhostPositions, fit_screen
+from thincam_jax.measured.calibration import fit_screen
+from thincam_jax.measured.calibration.screen_fit import GhostPositions
 from thincam_jax.units import deg, nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels and cells, in seconds

@@ -22,16 +22,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.imaging.metrics import (
-    align,
-    cut_off,
-    first_common_zero,
-    low_frequency_value,
-    psnr,
-    resolved_element,
-    usaf_contrast,
-)
-from thincam_jax.imaging.targets import line_pair, resize, sample_image, usaf1951, usaf1951_elements
+from thincam_jax.imaging.metrics import align, psnr
+from thincam_jax.imaging.metrics.mtf import cut_off, first_common_zero, low_frequency_value
+from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
+from thincam_jax.imaging.targets import resize, sample_image, usaf1951
+from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
+from thincam_jax.lensless.phase_shift import fringe_scanned_otf, phase_pair_otf
 from thincam_jax.reconstruction import fringe_scanning, phase_pairs
 from thincam_jax.units import nm
 
@@ -101,7 +97,7 @@ def along_u(response):
 
 def scanned(distance):
     """H_FS of a distance without its carrier e^{jX}, real, on the reference plane's scale."""
-    response = along_u(tc.fringe_scanned_otf(camera(beta_1, 0, distance), **light))
+    response = along_u(fringe_scanned_otf(camera(beta_1, 0, distance), **light))
     on_the_sensor = beta_1 / (1 + distance / 250.0) ** 2  # the shadow is magnified by 1 + d/t
     response = (response * np.exp(-1j * math.pi**2 * frequency**2 / on_the_sensor)).real
     # A frequency of the reference plane is far/distance times as high on this sensor.
@@ -110,7 +106,7 @@ def scanned(distance):
 
 def pair(beta):
     """H_B of a pitch."""
-    return along_u(tc.phase_pair_otf(camera(beta, 0, far), **light))
+    return along_u(phase_pair_otf(camera(beta, 0, far), **light))
 
 
 def root_mean_square(responses):

@@ -21,7 +21,8 @@ import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.measured import Preparation, Raw
-from thincam_jax.studies import pixel_noise, reconstruct_prepared
+from thincam_jax.measured.examination import examine
+from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
 
 SMALL = os.environ.get("THINCAM_SIZE") == "small"
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments"))
@@ -89,7 +90,7 @@ def made(psf, capture, background=DARK, bayer=None):
     """The image (3, y, x), and what was said."""
     capture, psf = Raw(capture, 12, name="capture"), Raw(psf, 12, name="PSF")
     options = Preparation(bayer=bayer)
-    examined = measured.examine([capture], psf, options)
+    examined = examine([capture], psf, options)
     assert examined.psf is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

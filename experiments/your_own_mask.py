@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
+from thincam_jax.lensless.masks import AxisFactors, MaskTerms
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in seconds
@@ -59,9 +60,9 @@ class GolombSlits(tc.AbstractFactoredMask):
         middles = (jnp.asarray(MARKS) - MARKS[-1] / 2) * self.unit
         edges = jnp.stack([middles - self.slit / 2, middles + self.slit / 2], axis=-1).ravel()
         open_or_dark = jnp.asarray(np.arange(edges.size - 1) % 2 == 0, edges.dtype)
-        factors = tc.AxisFactors(edges, jax.lax.complex(open_or_dark, 0 * open_or_dark)[None])
+        factors = AxisFactors(edges, jax.lax.complex(open_or_dark, 0 * open_or_dark)[None])
         one = factors.values[0, :1]
-        return tc.MaskTerms(one, factors, factors)  # one product, the same on both axes
+        return MaskTerms(one, factors, factors)  # one product, the same on both axes
 
 
 # %%

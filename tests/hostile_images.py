@@ -24,8 +24,27 @@ from matplotlib import pyplot
 import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.imaging import metrics, operators, targets
+from thincam_jax.imaging.metrics.mtf import (
+    cut_off,
+    first_common_zero,
+    low_frequency_value,
+    zero_crossings,
+)
+from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
+from thincam_jax.imaging.operators.low_rank import low_rank_psf
+from thincam_jax.imaging.operators.masked import Scaled
+from thincam_jax.imaging.targets.patterns import point_grid, slanted_edge
+from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
+from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence
+from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
+from thincam_jax.lensless.phase_shift import harmonic_otf
 from thincam_jax.measured import calibration
+from thincam_jax.measured.calibration.screen_fit import GhostPositions
+from thincam_jax.measured.exposures import ExposedFrames, merge_exposures
 from thincam_jax.reconstruction import depth
+from thincam_jax.reconstruction.depth.find import depth_of_colours, object_regions
+from thincam_jax.reconstruction.depth.focus import focus_measure
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 
 
 def drawn(function: Callable[..., Any], **given: Any) -> Call:
@@ -50,7 +69,7 @@ def streamed(captures: Any) -> Any:
 
 
 THREE = np.array([100.0, 200.0, 300.0])
-SWEEP = depth.RefocusSweep(RANDOM.random((3, 9, 12)), THREE, np.float64(0.01))
+SWEEP = RefocusSweep(RANDOM.random((3, 9, 12)), THREE, np.float64(0.01))
 DEPTHS = (
     call(depth.refocus_distances, nearest=100.0, farthest=300.0, count=3),
     call(depth.axial_resolution, camera=camera(), object_distance=250.0),
@@ -66,7 +85,7 @@ DEPTHS = (
         solver=call(tc.Ridge, ridge=1e-2),
     ),
     call(
-        depth.focus_measure,
+        focus_measure,
         image=IMAGE,
         measure="gradient_energy",
         smoothing=1.0,
@@ -81,33 +100,33 @@ DEPTHS = (
         regions=np.ones((9, 12), int),
         prominence=0.1,
     ),
-    call(depth.object_regions, sweep=SWEEP, threshold=0.25, smoothing=1.0, least=2),
+    call(object_regions, sweep=SWEEP, threshold=0.25, smoothing=1.0, least=2),
     call(
         depth.all_in_focus,
         sweep=SWEEP,
         depth=call(depth.depth_map, sweep=SWEEP, smoothing=1.0, window=2.0),
         smoothing=2.0,
     ),
-    call(depth.depth_of_colours, images=RANDOM.random((3, 2, 9, 12)), distances=[100.0, 200, 300]),
+    call(depth_of_colours, images=RANDOM.random((3, 2, 9, 12)), distances=[100.0, 200, 300]),
 )
-CHART, ELEMENTS = targets.usaf1951((64, 80), layers=1), targets.usaf1951_elements(layers=1)
+CHART, ELEMENTS = targets.usaf1951((64, 80), layers=1), usaf1951_elements(layers=1)
 CURVE = {"frequency": np.linspace(0, 5, 60), "response": np.cos(np.linspace(0, 5, 60))}
 PICTURES = (
-    call(targets.point_grid, shape=(9, 12), count=(2, 3)),
+    call(point_grid, shape=(9, 12), count=(2, 3)),
     call(targets.siemens_star, shape=(9, 12), spokes=8),
-    call(targets.slanted_edge, shape=(9, 12), angle=0.1, low=0.1, high=0.9),
+    call(slanted_edge, shape=(9, 12), angle=0.1, low=0.1, high=0.9),
     call(
         targets.usaf1951, shape=(9, 12), layers=2, polarity="bright_on_dark", pixels_per_chart=9.0
     ),
-    call(targets.usaf1951_elements, layers=2, first_group=-2),
-    call(targets.line_pair, element=ELEMENTS[0], width=64.0),
+    call(usaf1951_elements, layers=2, first_group=-2),
+    call(line_pair, element=ELEMENTS[0], width=64.0),
     call(targets.resize, image=IMAGE, shape=(5, 6)),
     call(targets.sample_image, name="camera"),
     call(metrics.align, image=IMAGE, reference=IMAGE[::-1]),
     call(
-        metrics.resolved_element,
+        resolved_element,
         records=call(
-            metrics.usaf_contrast,
+            usaf_contrast,
             image=CHART,
             elements=ELEMENTS,
             pixels_per_chart=64.0,
@@ -115,10 +134,10 @@ PICTURES = (
         ),
         threshold=0.1,
     ),
-    call(metrics.low_frequency_value, **CURVE),
-    call(metrics.cut_off, **CURVE, part=0.05),
-    call(metrics.zero_crossings, **CURVE),
-    call(metrics.first_common_zero, frequency=CURVE["frequency"], responses=[CURVE["response"]]),
+    call(low_frequency_value, **CURVE),
+    call(cut_off, **CURVE, part=0.05),
+    call(zero_crossings, **CURVE),
+    call(first_common_zero, frequency=CURVE["frequency"], responses=[CURVE["response"]]),
 )
 PARTS = (
     call(
@@ -131,7 +150,7 @@ PARTS = (
         window=(16, 20),
     ),
     call(
-        operators.low_rank_psf,
+        low_rank_psf,
         psfs=RANDOM.random((2, 3, 7, 5)),
         pitch=0.1,
         sensor_shape=(9, 12),
@@ -145,7 +164,7 @@ PARTS = (
 OPERATORS = (
     *PARTS,
     call(operators.Masked, operator=PARTS[2], valid=np.ones((12, 15), bool)),
-    call(operators.Scaled, operator=PARTS[2], gain=2.0),
+    call(Scaled, operator=PARTS[2], gain=2.0),
     call(lambda first, second: operators.Stacked([first, second]), first=PARTS[2], second=PARTS[2]),
 )
 FIGURES = (
@@ -166,7 +185,7 @@ FIGURES = (
         labels=("a", "b", "c"),
     ),
 )
-BLANK = call(tc.MaskBlank, shape=(24, 32), pitch=0.01, material=1.5)
+BLANK = call(MaskBlank, shape=(24, 32), pitch=0.01, material=1.5)
 FRAMES = RANDOM.integers(0, 4000, (3, 9, 12))
 FURTHER = (
     call(tc.Stream, recording=seen(), solver=call(tc.AdmmTV, tau=0.5, iterations=4), steps=2),
@@ -182,7 +201,7 @@ FURTHER = (
         interpolation="cells",
     ),
     call(
-        tc.voronoi_fresnel,
+        voronoi_fresnel,
         key=0,
         blank=BLANK,
         sites=3,
@@ -190,23 +209,21 @@ FURTHER = (
         wavelength=WAVE,
         relaxations=2,
     ),
-    call(tc.maximum_length_sequence, length=7),
+    call(maximum_length_sequence, length=7),
     call(tc.read_mask, path="nothing", cell=0.03),
-    call(tc.harmonic_otf, camera=camera(), harmonic=2, wavelength=WAVE, object_distance=250.0),
+    call(harmonic_otf, camera=camera(), harmonic=2, wavelength=WAVE, object_distance=250.0),
     call(
-        measured.merge_exposures,
-        exposures=[measured.ExposedFrames(0.1, FRAMES, FRAMES // 100)] * 2,
-        full_scale=4095,
+        merge_exposures, exposures=[ExposedFrames(0.1, FRAMES, FRAMES // 100)] * 2, full_scale=4095
     ),
     call(
-        lambda one, full_scale: measured.merge_exposures([one], full_scale),
-        one=call(measured.ExposedFrames, exposure=0.1, frames=FRAMES, dark=FRAMES // 100),
+        lambda one, full_scale: merge_exposures([one], full_scale),
+        one=call(ExposedFrames, exposure=0.1, frames=FRAMES, dark=FRAMES // 100),
         full_scale=4095,
     ),
     call(
         calibration.fit_screen,
         measured=call(
-            calibration.GhostPositions,
+            GhostPositions,
             pixels=RANDOM.random((4, 2)),
             points=RANDOM.random((4, 2)),
             orders=[0, 1, 2, 1],

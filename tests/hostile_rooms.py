@@ -9,13 +9,47 @@ from hostile_table import IMAGE, MASKS, RANDOM, SENSOR, TWO, WAVE, ZONES, call, 
 
 import thincam_jax as tc
 from thincam_jax import design, hardware, learn, measured, studies
+from thincam_jax.design.design import Design
+from thincam_jax.design.fronts import non_dominated
+from thincam_jax.design.match import MatchSettings, response_misfit, ring_levels
+from thincam_jax.design.objectives import (
+    Tolerances,
+    bayes_error,
+    channels,
+    limit,
+    mismatch_error,
+    robust_error,
+    unevenness,
+    worst_ratio_db,
+)
+from thincam_jax.design.phase_mask import MaskSetting, mask_of_phase, one_turn
+from thincam_jax.design.phase_retrieval import contour_target
+from thincam_jax.design.plate import Plate, Viewing, judge_plate
+from thincam_jax.design.ranking import score_design
+from thincam_jax.design.setup import fit_power_law
+from thincam_jax.design.space import Limits
 from thincam_jax.hardware.acquisition import plan as plans
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
+from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
 from thincam_jax.hardware.stages.zaber import ZaberStage
 from thincam_jax.imaging.operators import Separable
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions
+from thincam_jax.learn.suggester_training import SuggesterTraining
+from thincam_jax.learn.suggestions import Suggester
+from thincam_jax.learn.training import TrainingOptions
+from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.measured import calibration
+from thincam_jax.measured.bayer import demosaic, demosaic_mask
+from thincam_jax.measured.calibration import calibrate_separable
+from thincam_jax.measured.calibration.hadamard import hadamard_pattern, walsh_hadamard
+from thincam_jax.measured.calibration.start import PsfSearch
+from thincam_jax.measured.read import list_captures
+from thincam_jax.measured.write import log_text
+from thincam_jax.studies.mask_captures import ComparedMask, Setting
+from thincam_jax.studies.mask_comparison import ComparedScene, Tuning
 
 
 def space(base: Any, variable: Any, limits: Any) -> design.DesignSpace:
@@ -37,7 +71,7 @@ def denoised(network: Any, image: Any, sigma: Any) -> Any:
 
 
 EXPOSURES = call(tc.Exposures, beta=[25.0, 13.0], distance=6.5, wavelength=WAVE, width=5.0)
-DESIGN = call(design.Design, exposures=EXPOSURES)
+DESIGN = call(Design, exposures=EXPOSURES)
 SETUP = call(
     design.Setup,
     pitch=0.02,
@@ -52,12 +86,12 @@ SPACE = call(
     space,
     base=DESIGN,
     variable=call(design.Variable, name="beta", lower=10.0, upper=25.0, captures=(0,)),
-    limits=call(design.Limits, mask_pixel=0.01, thickness=8.0, captures=4, exposure=2.0),
+    limits=call(Limits, mask_pixel=0.01, thickness=8.0, captures=4, exposure=2.0),
 )
 RINGS = call(design.Polar, highest=80.0, count=64, directions=2)
 SEEN = {"setup": SETUP, "synthesis": np.eye(2), "frequencies": RINGS}
-KNOWN = call(design.channels, design=DESIGN, **SEEN)
-TOLERANCES = call(design.Tolerances, beta=0.01, distance=0.01, wavelength=1e-5, tilt=0.01)
+KNOWN = call(channels, design=DESIGN, **SEEN)
+TOLERANCES = call(Tolerances, beta=0.01, distance=0.01, wavelength=1e-5, tilt=0.01)
 PROBLEM = call(
     design.design_problem,
     objective=call(design.BayesError),
@@ -67,23 +101,23 @@ PROBLEM = call(
     counts=call(design.FrequencyCounts, radii=64, directions=1, exact=64),
 )
 KEY = jax.random.key(3)
-RELIEF = call(tc.MaskBlank, shape=(8, 10), pitch=0.05, material=1.5)
+RELIEF = call(MaskBlank, shape=(8, 10), pitch=0.05, material=1.5)
 DESIGNS = (
     SPACE,
     call(
         design.shots, beta=[25.0, 13.0], distance=6.5, phases=[0.0, 1.0], wavelength=WAVE, width=5
     ),
-    call(design.bayes_error, known=KNOWN),
-    call(design.mismatch_error, known=KNOWN, actual=KNOWN),
-    call(design.limit, known=KNOWN, frequencies=RINGS, ratio=1.0, rings=16),
+    call(bayes_error, known=KNOWN),
+    call(mismatch_error, known=KNOWN, actual=KNOWN),
+    call(limit, known=KNOWN, frequencies=RINGS, ratio=1.0, rings=16),
     *(
         call(f, known=KNOWN, frequencies=RINGS, band=(0.05, 0.5), rings=16)
-        for f in (design.unevenness, design.worst_ratio_db)
+        for f in (unevenness, worst_ratio_db)
     ),
-    call(design.ring_levels, known=KNOWN, frequencies=RINGS, rings=16),
-    call(design.response_misfit, known=KNOWN, frequencies=RINGS, target=np.ones(8)),
-    call(design.robust_error, design=DESIGN, tolerances=TOLERANCES, how="mean", **SEEN),
-    call(design.score_design, problem=PROBLEM, design=DESIGN, name="a"),
+    call(ring_levels, known=KNOWN, frequencies=RINGS, rings=16),
+    call(response_misfit, known=KNOWN, frequencies=RINGS, target=np.ones(8)),
+    call(robust_error, design=DESIGN, tolerances=TOLERANCES, how="mean", **SEEN),
+    call(score_design, problem=PROBLEM, design=DESIGN, name="a"),
     call(
         design.find_designs,
         problem=PROBLEM,
@@ -95,31 +129,31 @@ DESIGNS = (
         design.match_response,
         model=call(design.ResponseModel, space=SPACE, **SEEN, rings=8),
         target=np.ones(8),
-        settings=call(design.MatchSettings, starts=1, samples=4, steps=2, tolerance=1e-3),
+        settings=call(MatchSettings, starts=1, samples=4, steps=2, tolerance=1e-3),
         key=KEY,
     ),
-    call(at_once(design.fit_power_law, "images"), images=RANDOM.random((32, 40))),
-    call(design.non_dominated, points=RANDOM.random((4, 2)), larger=(True, False)),
-    call(design.MaskSetting, camera=camera(MASKS[-1]), wavelengths=WAVE, field_shape=(5, 6)),
+    call(at_once(fit_power_law, "images"), images=RANDOM.random((32, 40))),
+    call(non_dominated, points=RANDOM.random((4, 2)), larger=(True, False)),
+    call(MaskSetting, camera=camera(MASKS[-1]), wavelengths=WAVE, field_shape=(5, 6)),
     call(
-        design.mask_of_phase,
+        mask_of_phase,
         phase=RANDOM.random((8, 10)).astype("f4"),
         blank=RELIEF,
         wavelength=WAVE,
-        limits=call(design.one_turn, blank=RELIEF, wavelength=WAVE, levels=4),
+        limits=call(one_turn, blank=RELIEF, wavelength=WAVE, levels=4),
     ),
     call(
-        design.contour_target,
+        contour_target,
         key=KEY,
         grid=call(tc.Grid, shape=(8, 10), pitch=0.05),
         feature=0.2,
         line_width=0.1,
     ),
     call(
-        design.judge_plate,
-        plate=call(design.Plate, glass_thickness=5.0, film_thickness=0.016, lens_distance=10.0),
+        judge_plate,
+        plate=call(Plate, glass_thickness=5.0, film_thickness=0.016, lens_distance=10.0),
         viewing=call(
-            design.Viewing, sensor=SENSOR, object_distance=550.0, object_width=150.0, snr_db=30.0
+            Viewing, sensor=SENSOR, object_distance=550.0, object_width=150.0, snr_db=30.0
         ),
     ),
 )
@@ -160,21 +194,18 @@ STUDIES = (
         ),
         target=TARGET,
     ),
-    call(at_once(studies.ComparedMask, "masks"), masks=ZONES, sort="a", synthesis="separate"),
-    call(studies.Setting, sensor=SENSOR, distance=6.5, field=(9, 12), width=1.2, read_noise=3.0),
+    call(at_once(ComparedMask, "masks"), masks=ZONES, sort="a", synthesis="separate"),
+    call(Setting, sensor=SENSOR, distance=6.5, field=(9, 12), width=1.2, read_noise=3.0),
     call(
-        studies.Tuning,
-        scene=call(studies.ComparedScene, image=IMAGE, prior="flat"),
-        tau=(0.5, 1.0),
-        iterations=60,
+        Tuning, scene=call(ComparedScene, image=IMAGE, prior="flat"), tau=(0.5, 1.0), iterations=60
     ),
 )
 LEARNED = (
-    call(learn.TrainingOptions, steps=5, rate=1e-3, warm_up=2, averaging=0.9, seed=0, falling=0.5),
-    call(learn.NetworkOptions, steps=2, widths=(8, 8)),
-    call(learn.SuggesterTraining, samples=8, guesses=1, width=4, depth=1, rate=1e-3),
+    call(TrainingOptions, steps=5, rate=1e-3, warm_up=2, averaging=0.9, seed=0, falling=0.5),
+    call(NetworkOptions, steps=2, widths=(8, 8)),
+    call(SuggesterTraining, samples=8, guesses=1, width=4, depth=1, rate=1e-3),
     call(
-        learn.RefocusCamera,
+        RefocusCamera,
         camera=camera(),
         light=WAVE,
         field_shape=(9, 12),
@@ -192,7 +223,7 @@ LEARNED = (
     call(
         learn.suggest,
         suggester=call(
-            learn.Suggester,
+            Suggester,
             model=call(design.ResponseModel, space=SPACE, **SEEN, rings=8),
             key=KEY,
             guesses=2,
@@ -206,7 +237,7 @@ LEARNED = (
 SETTINGS = call(
     hardware.CameraSettings,
     exposure=0.01,
-    region=call(hardware.Region, top=0, left=0, height=10, width=12),
+    region=call(Region, top=0, left=0, height=10, width=12),
     pixel_format="Mono12",
     gain=0.0,
 )
@@ -259,7 +290,7 @@ CALIBRATIONS = (
         object_distance=250.0,
         wavelength=WAVE,
         search=call(
-            calibration.PsfSearch,
+            PsfSearch,
             parameters=("beta", "phase"),
             relative=0.1,
             centre=0.05,
@@ -276,7 +307,7 @@ CALIBRATIONS = (
         smoothing=1.0,
         max_steps=2,
     ),
-    call(tc.calibrate_separable, rows=TWO, columns=TWO, shown="stripes"),
+    call(calibrate_separable, rows=TWO, columns=TWO, shown="stripes"),
     call(
         tc.fit_separable,
         images=RANDOM.random((4, 9, 12)),
@@ -286,16 +317,16 @@ CALIBRATIONS = (
         tolerance=1e-3,
     ),
     SERIES,
-    call(calibration.hadamard_pattern, index=1, object_shape=(2, 4), order="natural"),
-    call(calibration.walsh_hadamard, values=RANDOM.random((4, 3))),
-    call(measured.demosaic, mosaic=RANDOM.random((6, 8)), pattern="RGGB", method="bilinear"),
-    call(measured.demosaic_mask, mask=np.ones((6, 8), bool), pattern="RGGB", method="superpixel"),
+    call(hadamard_pattern, index=1, object_shape=(2, 4), order="natural"),
+    call(walsh_hadamard, values=RANDOM.random((4, 3))),
+    call(demosaic, mosaic=RANDOM.random((6, 8)), pattern="RGGB", method="bilinear"),
+    call(demosaic_mask, mask=np.ones((6, 8), bool), pattern="RGGB", method="superpixel"),
     call(
         measured.to_display, image=TWO[:1], white_balance="grey_world", gamma=2.2, percentile=99.0
     ),
     call(measured.read_image, path="nothing", bits=12),
-    call(measured.list_captures, folder="nothing", bits=12),
-    call(measured.log_text, log={"a": 1.0}),
+    call(list_captures, folder="nothing", bits=12),
+    call(log_text, log={"a": 1.0}),
     call(tc.load_image, path="nothing"),
 )
 

@@ -11,8 +11,14 @@ import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.refractive_index import bk7
+from thincam_jax.lensless.masks import MaskBlank, UniformlyRedundantArray, random_cells
+from thincam_jax.lensless.masks.reliefs import diffuser
+from thincam_jax.lensless.phase_shift import fringe_scanned_otf, phase_pair_otf
 from thincam_jax.plot.explorer import Explorer
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.hologram import refracted
+from thincam_jax.waveguide.screen_to_sensor import ghost_images
 
 
 @dataclass(frozen=True)
@@ -70,15 +76,15 @@ MASKS = (
     call(tc.Pinhole, width=0.1),
     call(tc.RadialMask, rings=np.array([1.0, 0.0, 1.0]), ring=0.1),
     call(tc.ModifiedUniformlyRedundantArray, order=5, cell=0.1),
-    call(tc.UniformlyRedundantArray, orders=(5, 3), cell=0.1),
+    call(UniformlyRedundantArray, orders=(5, 3), cell=0.1),
     call(tc.LensletArray, focal_length=5.0, pitch=0.4, shape=(2, 3)),
     call(tc.SampledMask, amplitude=RANDOM.random((6, 8)).round(), pitch=0.1),
     call(tc.SeparableMask, rows=np.array([1.0, 0, 1]), columns=np.array([0, 1.0, 1, 0]), cell=0.1),
-    call(tc.random_cells, key=3, width=0.8, cell=0.1, open_fraction=0.4),
+    call(random_cells, key=3, width=0.8, cell=0.1, open_fraction=0.4),
     call(
-        tc.diffuser,
+        diffuser,
         key=3,
-        blank=call(tc.MaskBlank, shape=(8, 10), pitch=0.05, material=call(wg.bk7)),
+        blank=call(MaskBlank, shape=(8, 10), pitch=0.05, material=call(bk7)),
         correlation_length=0.2,
         rms_slope=0.05,
     ),
@@ -179,7 +185,7 @@ OPTICS = (
     ),
     *(
         call(f, camera=camera(), wavelength=WAVE, object_distance=250.0)
-        for f in (tc.fringe_scanned_otf, tc.phase_pair_otf)
+        for f in (fringe_scanned_otf, phase_pair_otf)
     ),
     *(
         call(
@@ -244,7 +250,7 @@ OPTICS = (
     ),
     call(wg.system_operator, camera=THROUGH, plane=BEHIND, orders=2),
     call(
-        wg.ghost_images,
+        ghost_images,
         camera=THROUGH,
         field=np.array([[0.0, 0.1], [0.05, 0.0]]),
         object_distance=550.0,
@@ -264,5 +270,5 @@ OPTICS = (
         farthest=600.0,
         orders=2,
     ),
-    call(wg.refracted, angle=0.3, before=1.0, after=1.5),
+    call(refracted, angle=0.3, before=1.0, after=1.5),
 )

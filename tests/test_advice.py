@@ -14,6 +14,8 @@ import pytest
 import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.imaging.operators import Separable
+from thincam_jax.lensless import AccuracyWarning
+from thincam_jax.reconstruction import solve_fixed_point
 from thincam_jax.units import mm, nm, um
 
 RANDOM = np.random.default_rng(0)
@@ -45,7 +47,7 @@ def solved(capture: Any) -> Any:
     """The objective's minimiser under jit."""
     problem = tc.Recording(capture[None], tc.Psfs(PSF[None])).problem()
     start = jnp.zeros((1, 1, *problem.operators[0].in_shape[-2:]), capture.dtype)
-    return tc.solve_fixed_point(problem, start, iterations=3).image
+    return solve_fixed_point(problem, start, iterations=3).image
 
 
 def fine_zones() -> tc.LenslessCamera:
@@ -167,5 +169,5 @@ def test_advice_can_be_followed(case):
         case.wrong()
     assert case.advice in " ".join(str(caught.value).split())
     with warnings.catch_warnings():
-        warnings.simplefilter("error", tc.AccuracyWarning)
+        warnings.simplefilter("error", AccuracyWarning)
         case.followed()

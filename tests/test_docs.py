@@ -2,6 +2,7 @@
 
 import ast
 import json
+import operator
 import os
 import re
 import runpy
@@ -22,11 +23,12 @@ from commands.reconstruct import simulated
 
 import thincam_jax as tc
 from helpers import ROOT
-from thincam_jax import learn
 from thincam_jax.commands import cli
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.measured.write import log_text
 from thincam_jax.units import nm, um
 
 PACKAGE = ROOT / "thincam_jax"
@@ -142,7 +144,7 @@ def test_real_captures_page(tmp_path, monkeypatch, capsys):
     with PIL.Image.open("result.png") as shown:
         assert shown.mode == "RGB" and shown.size == (38, 30)
     assert json.loads((tmp_path / "result.json").read_text("utf-8")) == json.loads(
-        names["measured"].log_text(ready.log)
+        log_text(ready.log)
     )
 
 
@@ -366,7 +368,7 @@ def test_learned_thesis_page(monkeypatch):
 
         mask = tc.FresnelZoneAperture(beta=3.2, width=5.6)
         thin = tc.LenslessCamera(mask, tc.Sensor((64, 64), 176 * um), 7.5)
-        able = learn.RefocusCamera(thin, 500 * nm, field_shape=(32, 32), near=50.0, far=200.0)
+        able = RefocusCamera(thin, 500 * nm, field_shape=(32, 32), near=50.0, far=200.0)
         assert abs(lost(thesis(64), script["THESIS"])) < 0.05
         assert lost(able, (60.0, 120.0)) > 0.5
 
@@ -486,6 +488,7 @@ def public(module: str, name: str) -> bool:
     assert isinstance(listed, ast.Tuple)
     packages = {"thincam_jax", "thincam_jax.units"}
     packages |= {one.value for one in listed.elts if isinstance(one, ast.Constant)}
+    packages |= {f"thincam_jax.{one}" for one in ast.literal_eval(assigned("MODULES"))}
     return module in packages or f"{module}.{name}" in packages
 
 
@@ -493,7 +496,7 @@ def test_the_reference_names_what_packages_export():
     """By the program of docs/conf.py itself, without what needs Sphinx."""
     path = ROOT / "docs/conf.py"
     conf = ast.parse(path.read_text("utf-8"))
-    constants = {"DOCS", "PACKAGE", "TOP", "PACKAGES", "ROOMS"}
+    constants = {"DOCS", "PACKAGE", "TOP", "PACKAGES", "MODULES", "ROOMS"}
     conf.body = [
         node
         for node in conf.body
@@ -506,6 +509,42 @@ def test_the_reference_names_what_packages_export():
     pages = {one: program["reference_page"](one, seen) for one in program["PACKAGES"]}
     assert "   PlugAndPlay\n" in pages["thincam_jax"]
     assert "   residual_noise\n" not in "".join(pages.values())
+    listed = [
+        f"{package}.{name}"
+        for package, page in pages.items()
+        for name in re.findall(r"^   (\w+)$", page, re.MULTILINE)
+    ]
+    assert sorted(listed) == sorted(promised(packages=False))
+    assert {f"thincam_jax.{name}" for name in program["MODULES"]}.isdisjoint(pages)
+    assert "   find_plate\n" in program["modules_page"]()
+
+
+def promised(packages=True) -> list[str]:
+    """The list of docs/api/index.md: names that versions keep, by task."""
+    text = (ROOT / "docs/api/index.md").read_text("utf-8").split("by task")[1].split("What they")[0]
+    rows = [row for row in text.split("\n- ") if packages or not row.startswith("**Packages**")]
+    found = [name for row in rows for name in re.findall(r"`tc\.([\w.]+)`", row)]
+    return [f"thincam_jax.{name}" for name in found]
+
+
+def exported() -> list[str]:
+    """What the packages export: `X as X` in their `__init__` files."""
+    found = []
+    for path in sorted(PACKAGE.rglob("__init__.py*")):
+        package = ".".join(path.parent.relative_to(ROOT).parts)
+        for node in ast.parse(path.read_text("utf-8")).body:
+            if isinstance(node, ast.ImportFrom):
+                found += [f"{package}.{one.name}" for one in node.names if one.asname == one.name]
+    return found
+
+
+def test_versions_keep_few_names_and_these():
+    """The list of the reference is what the packages export; a new name replaces another."""
+    assert sorted(promised()) == sorted(exported())
+    assert len(promised()) <= 180
+    assert len([name for name in promised() if name.count(".") == 1]) <= 60
+    for name in promised():
+        assert operator.attrgetter(name.removeprefix("thincam_jax."))(tc) is not None
 
 
 USERS = [path.read_text("utf-8") for path in sorted((ROOT / "experiments").glob("*.py"))]

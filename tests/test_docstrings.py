@@ -5,6 +5,7 @@ import contextlib
 import doctest
 import inspect
 import io
+import operator
 import re
 
 import jax
@@ -33,7 +34,7 @@ def test_a_public_name_has_a_short_example_and_says_what_to_see(name):
     (example,) = EXAMPLE.findall(text)
     assert len([line for line in example.splitlines() if line.strip()]) <= 8
     (seen,) = re.findall(r"\*\*See also\*\*: (.*)\.\Z", text)
-    assert all(hasattr(tc, other) for other in re.findall(r"`(\w+)`", seen))
+    assert all(operator.attrgetter(other)(tc) for other in re.findall(r"`([\w.]+)`", seen))
 
 
 def examples():

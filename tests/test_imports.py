@@ -162,6 +162,15 @@ def test_sub_packages_are_attributes_and_wait_for_their_use():
 def test_a_name_that_is_not_there():
     with pytest.raises(AttributeError, match="no_such_camera"):
         _ = tc.no_such_camera  # pyright: ignore
+    with pytest.raises(AttributeError, match="did you mean reconstruct?"):
+        _ = tc.reconstuct  # pyright: ignore
+    with pytest.raises(AttributeError, match="did you mean find_designs?"):
+        _ = tc.design.find_design  # pyright: ignore
+
+
+def test_documented_paths_need_no_import_of_their_own():
+    paths = "imaging.operators.Matrix", "lensless.masks.reliefs.diffuser", "design.phase_mask"
+    imported_by("import thincam_jax as tc\n" + "\n".join(f"tc.{path}" for path in paths))
 
 
 def test_the_version_is_that_of_the_installation():

@@ -8,6 +8,7 @@ import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax._core import checks
 from thincam_jax.imaging import operators
+from thincam_jax.measured.raw import CaptureFileError
 from thincam_jax.units import nm, um
 
 ZONES = tc.FresnelZoneAperture(beta=25.0, phase=0.0, width=2.0)
@@ -90,6 +91,6 @@ def test_marks_of_a_name_are_written_out(tmp_path):
     for content in (None, b"no image"):
         if content is not None:
             path.write_bytes(content)
-        with pytest.raises(measured.CaptureFileError) as caught:
+        with pytest.raises(CaptureFileError) as caught:
             measured.read_image(path)
         assert str(caught.value).isprintable() and "\\x1b[31m\\u202eb.png" in str(caught.value)

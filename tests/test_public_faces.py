@@ -11,13 +11,25 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 import thincam_jax as tc
-from thincam_jax.design import contour_target
+from thincam_jax.design.phase_retrieval import contour_target
 from thincam_jax.units import um
 
 FACES = (
     *("design", "hardware", "learn", "lensless", "measured", "plot", "reconstruction", "studies"),
-    *("imaging.operators", "imaging.targets", "learn.denoiser", "learn.refocusing", "waveguide"),
+    *("imaging.operators", "imaging.targets", "lensless.masks", "waveguide"),
     *("measured.calibration", "reconstruction.depth"),
+)
+# Modules of which scripts and tests call functions by their path.
+MODULES = (
+    *("design.end_to_end", "design.fronts", "design.match"),
+    *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
+    *("design.plate", "design.ranking", "design.sensitivity"),
+    *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
+    *("learn.suggester_training", "learn.suggestions", "lensless.masks.reliefs"),
+    *("measured.calibration.screen_fit", "measured.exposures", "measured.sensor"),
+    *("reconstruction.depth.find", "reconstruction.problem", "studies.mask_comparison"),
+    *("studies.response", "studies.study", "waveguide.colours"),
+    *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.
 WITHIN = {"draw_batch", "linear_objective", "match_objective", "restored_objective", "drawn_error"}
@@ -26,7 +38,11 @@ WITHIN |= {"FrontSearch", "Suggester", "Training", "TrainingDescents", "adjoint_
 
 def faces() -> dict[str, object]:
     modules = [tc, *(importlib.import_module(f"thincam_jax.{name}") for name in FACES)]
-    return {name: getattr(face, name) for face in modules for name in dir(face) if name[0] != "_"}
+    found = {name: getattr(face, name) for face in modules for name in dir(face) if name[0] != "_"}
+    for module in (importlib.import_module(f"thincam_jax.{name}") for name in MODULES):
+        own = {n: one for n, one in vars(module).items() if n[0] != "_"}
+        found |= {n: o for n, o in own.items() if getattr(o, "__module__", "") == module.__name__}
+    return found
 
 
 def results(one: object) -> Iterator[tuple[str, object]]:

@@ -10,9 +10,8 @@
 Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)` explains one name.
 
 - cameras: `LenslessCamera`, `Sensor`; `waveguide.SeeThroughCamera`
-- masks: `FresnelZoneAperture`, `ModifiedUniformlyRedundantArray`, `UniformlyRedundantArray`,
-  `SeparableMask`, `Pinhole`, `RadialMask`, `LensletArray`, `PhaseMask`, `SampledMask`; own ones by
-  `AbstractFactoredMask`
+- masks: `FresnelZoneAperture`, `ModifiedUniformlyRedundantArray`, `SeparableMask`, `Pinhole`,
+  `RadialMask`, `LensletArray`, `PhaseMask`, `SampledMask`; own ones by `AbstractFactoredMask`
 - scenes: `ImagePlane`, `Scene`, `Spectrum`, `load_image`, `imaging.targets`
 - simulation: `psf`, `otf`, `capture`, `field_operator`, `GaussianNoise`, `PoissonGaussianNoise`
 - accuracy: `select_model`, `predict_error`, `plan`, `PsfMethod`
@@ -27,8 +26,11 @@ which `thincam --help` need not wait for.
 
 import lazy_loader
 
+from thincam_jax._core.names import modules_of
+
 # Without `__all__`, for which `help` would print every class in full.
-_attribute, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
+_names, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
+_attribute = modules_of(__name__, _names)
 
 
 def __getattr__(name: str):

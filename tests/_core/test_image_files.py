@@ -17,13 +17,15 @@ from thincam_jax._core import image_files
 from thincam_jax.commands.config_file import ConfigError, read_raw
 from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.learn.checkpoint import CheckpointError, read_description
-from thincam_jax.measured import CaptureFileError, NonlinearWarning, read_image
+from thincam_jax.measured import read_image
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import NonlinearWarning
 from thincam_jax.measured.sensor import SensorCalibration
 
 SHAPE = (21, 34)
 GREY = np.random.default_rng(0).integers(1, 255, SHAPE).astype(np.uint8)
 COLOUR = np.random.default_rng(1).integers(1, 255, (*SHAPE, 3)).astype(np.uint8)
-pytestmark = pytest.mark.filterwarnings("ignore::thincam_jax.measured.NonlinearWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::thincam_jax.measured.read.NonlinearWarning")
 
 
 def saved(pixels, kind, **options):

@@ -7,8 +7,8 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
-from thincam_jax.measured.calibration import PsfFit
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.measured.calibration.psf_fit import PsfFit
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.units import nm, um
 
 SENSOR = tc.Sensor((30, 41), 5.5 * um)

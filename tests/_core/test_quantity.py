@@ -20,7 +20,7 @@ from thincam_jax._core.quantity import (
     quantity,
     unchecked,
 )
-from thincam_jax.design import Design
+from thincam_jax.design.design import Design
 from thincam_jax.units import KINDS, parse_quantity
 
 

@@ -21,7 +21,6 @@ from thincam_jax.commands.cache import cache_state
 from thincam_jax.commands.kinds import examples
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
-from thincam_jax.studies import StudyScores
 from thincam_jax.studies.psf_accuracy import PsfAccuracy
 from thincam_jax.studies.psf_error_cost import (
     AccuracyResult,
@@ -29,6 +28,7 @@ from thincam_jax.studies.psf_error_cost import (
     ControlledCost,
     ReconstructionCosts,
 )
+from thincam_jax.studies.result import StudyScores
 
 runner = CliRunner()
 

@@ -3,16 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from thincam_jax.design import (
-    Design,
-    DesignSpace,
-    Setup,
-    SignalNoise,
-    Variable,
-    bayes_error,
-    channels,
-    shots,
-)
+from thincam_jax.design import DesignSpace, Setup, SignalNoise, Variable, shots
+from thincam_jax.design.design import Design
+from thincam_jax.design.objectives import bayes_error, channels
 from thincam_jax.reconstruction import phase_pairs
 
 WAVELENGTH = 500e-6

@@ -9,11 +9,8 @@ import numpy as np
 
 from thincam_jax.design import (
     BayesError,
-    Design,
-    DesignProblem,
     DesignSpace,
     FrequencyCounts,
-    Limits,
     PowerLaw,
     Setup,
     SignalNoise,
@@ -21,6 +18,9 @@ from thincam_jax.design import (
     design_problem,
     shots,
 )
+from thincam_jax.design.design import Design
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.space import Limits
 from thincam_jax.reconstruction import phase_pairs
 
 PAIR = (0.0, 1.5 * np.pi)

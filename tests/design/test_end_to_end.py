@@ -11,23 +11,12 @@ import pytest
 import thincam_jax as tc
 from helpers import AS_IN_USE, count_traces
 from thincam_jax._core.grids import Grid
-from thincam_jax.design import (
-    ConjugateGradients,
-    Design,
-    DesignProblem,
-    DesignSpace,
-    PhotonNoise,
-    PowerLaw,
-    Setup,
-    SignalNoise,
-    TrainedSensor,
-    Training,
-    Variable,
-    drawn_error,
-    end_to_end_error,
-    restore,
-    stochastic_descent,
-)
+from thincam_jax.design import DesignSpace, PhotonNoise, PowerLaw, Setup, SignalNoise, Variable
+from thincam_jax.design.design import Design
+from thincam_jax.design.end_to_end import drawn_error, end_to_end_error, restore
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.stochastic import stochastic_descent
+from thincam_jax.design.training import ConjugateGradients, TrainedSensor, Training
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 

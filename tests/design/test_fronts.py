@@ -7,18 +7,11 @@ import numpy as np
 import pytest
 from design import small
 
-from thincam_jax.design import (
-    DesignSpace,
-    FrontPoint,
-    Limits,
-    NonFiniteObjectiveError,
-    PhotonNoise,
-    ResolutionLimit,
-    SearchSettings,
-    find_front,
-    fronts,
-    non_dominated,
-)
+from thincam_jax.design import DesignSpace, PhotonNoise, SearchSettings, find_front, fronts
+from thincam_jax.design.fronts import FrontPoint, non_dominated
+from thincam_jax.design.objectives import ResolutionLimit
+from thincam_jax.design.search import NonFiniteObjectiveError
+from thincam_jax.design.space import Limits
 from thincam_jax.reconstruction import phase_pairs
 
 

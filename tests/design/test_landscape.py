@@ -8,19 +8,10 @@ import pytest
 from design import small
 from design.test_sensitivity import Bowl, Slope, found_at
 
-from thincam_jax.design import (
-    BayesError,
-    DesignSpace,
-    Landscape,
-    Limits,
-    ResolutionLimit,
-    Unevenness,
-    Variable,
-    WorstRatio,
-    evaluate_grid,
-    landscape_around,
-)
-from thincam_jax.design.landscape import drawn_variables, landscape_if_any
+from thincam_jax.design import BayesError, DesignSpace, Variable, landscape_around
+from thincam_jax.design.landscape import Landscape, drawn_variables, evaluate_grid, landscape_if_any
+from thincam_jax.design.objectives import ResolutionLimit, Unevenness, WorstRatio
+from thincam_jax.design.space import Limits
 
 
 def test_of_two_variables():

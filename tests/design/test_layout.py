@@ -6,12 +6,13 @@ import pytest
 
 import thincam_jax as tc
 from helpers import quick
+from thincam_jax.lensless.masks import random_cells
 from thincam_jax.units import um
 
 CENTRE = (0.05, -0.12)
 MASKS = {
     "mura": tc.ModifiedUniformlyRedundantArray(7, cell=30 * um, centre=CENTRE),
-    "random": tc.random_cells(1, 14 * 20 * um, 20 * um, height=9 * 20 * um),
+    "random": random_cells(1, 14 * 20 * um, 20 * um, height=9 * 20 * um),
     "gaps": tc.SampledMask(
         [[1.0, 0, 1], [1, 1, 0]], pitch=50 * um, fill_factor=0.64, centre=CENTRE
     ),

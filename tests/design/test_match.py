@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from design.setting import setup, two_betas
 
-from thincam_jax.design import MatchSettings, Polar, PowerLaw, ResponseModel, match_response
-from thincam_jax.design.match import _least_squares
+from thincam_jax.design import Polar, PowerLaw, ResponseModel, match_response
+from thincam_jax.design.match import MatchSettings, _least_squares
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16

@@ -11,16 +11,13 @@ from design import small
 from design.setting import HIGHEST, setup
 
 from helpers import count_traces, finite_difference
-from thincam_jax.design import (
-    BayesError,
-    Design,
-    PhotonNoise,
-    Polar,
-    PowerLaw,
-    Quadrant,
+from thincam_jax.design import BayesError, PhotonNoise, Polar, PowerLaw, SignalNoise
+from thincam_jax.design.design import Design
+from thincam_jax.design.frequencies import Quadrant
+from thincam_jax.design.objectives import (
+    Channels,
     ResolutionLimit,
     RobustError,
-    SignalNoise,
     Tolerances,
     Unevenness,
     WorstRatio,
@@ -28,11 +25,11 @@ from thincam_jax.design import (
     channels,
     limit,
     mismatch_error,
+    ring_means,
     robust_error,
     unevenness,
     worst_ratio_db,
 )
-from thincam_jax.design.objectives import Channels, ring_means
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction import phase_pairs
 

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from design.setting import setup, thesis_design
 
-from thincam_jax.design import (
-    Design,
-    Polar,
-    PowerLaw,
+from thincam_jax.design import Polar, PowerLaw
+from thincam_jax.design.design import Design
+from thincam_jax.design.objectives import (
     Tolerances,
     bayes_error,
     channels,

@@ -7,16 +7,10 @@ import pytest
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, relative_l2, value_and_slope
-from thincam_jax.design import (
+from thincam_jax.design import PhotonNoise, PowerLaw, Setup, SignalNoise
+from thincam_jax.design.phase_mask import (
     HeightLimits,
     MaskSetting,
-    PhotonNoise,
-    PowerLaw,
-    Setup,
-    SignalNoise,
-    TrainedSensor,
-    Training,
-    contour_target,
     cropped_error,
     linear_error,
     linear_objective,
@@ -25,12 +19,14 @@ from thincam_jax.design import (
     one_turn,
     refine_mask,
     restored_objective,
-    retrieve_phase,
 )
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape
+from thincam_jax.design.phase_retrieval import contour_target, retrieve_phase
+from thincam_jax.design.training import TrainedSensor, Training
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.targets import siemens_star
-from thincam_jax.lensless.masks import MaskBlank
-from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless import Path
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
 
 GREEN, DISTANCE, PITCH = 532 * nm, 2.0, 4 * um

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design import contour_mask, contour_target, match_error, retrieve_phase
-from thincam_jax.lensless.masks import MaskBlank
-from thincam_jax.lensless.propagation import Path
+from thincam_jax.design.phase_mask import contour_mask
+from thincam_jax.design.phase_retrieval import contour_target, match_error, retrieve_phase
+from thincam_jax.lensless import Path, masks
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
 
 GRID = tc.Grid((64, 80), 4 * um)
@@ -70,7 +71,7 @@ def test_refusals(key):
 
 @pytest.mark.thorough
 def test_the_mask_of_contours_concentrates_light_on_them():
-    blank = tc.MaskBlank((48, 48), 10 * um, 1.52)
+    blank = masks.MaskBlank((48, 48), 10 * um, 1.52)
     mask = contour_mask(3, blank, PATH, feature=80 * um, line_width=20 * um)
     assert 0 <= float(mask.height.min()) and float(mask.height.max()) < 1.1e-3  # one turn
     lines = contour_target(jax.random.key(3), blank.grid, feature=80 * um, line_width=20 * um)

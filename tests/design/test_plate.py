@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design import Plate, PlateLimits, PowerLaw, Viewing, find_plate, judge_plate
-from thincam_jax.design.plate import noise_variance
+from thincam_jax.design import PowerLaw
+from thincam_jax.design.plate import (
+    Plate,
+    PlateLimits,
+    Viewing,
+    find_plate,
+    judge_plate,
+    noise_variance,
+)
 from thincam_jax.units import deg, um
 from thincam_jax.waveguide import ObjectPlane, system_operator
 

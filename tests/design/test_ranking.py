@@ -6,14 +6,9 @@ import pytest
 from design import small
 from design.test_sensitivity import Bowl, found_at
 
-from thincam_jax.design import (
-    NonFiniteObjectiveError,
-    bayes_error,
-    distinct_designs,
-    rank_designs,
-    score_design,
-)
-from thincam_jax.design.objectives import ring_means
+from thincam_jax.design.objectives import bayes_error, ring_means
+from thincam_jax.design.ranking import distinct_designs, rank_designs, score_design
+from thincam_jax.design.search import NonFiniteObjectiveError
 
 
 def test_ranked_by_the_exact_value_and_orders_of_shots_are_one():

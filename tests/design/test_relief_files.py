@@ -8,7 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax._core.files import MeasurementError
-from thincam_jax.design import read_height_map, write_height_map, write_stl
+from thincam_jax.design.relief_files import read_height_map, write_height_map, write_stl
 from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.units import nm, um
 

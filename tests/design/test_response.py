@@ -7,11 +7,12 @@ import pytest
 from design.setting import HIGHEST, WAVELENGTH, setup, thesis_design
 
 from helpers import relative_l2
-from thincam_jax.design import Polar, PowerLaw, Quadrant, bayes_error, channels
-from thincam_jax.design.objectives import ring_means
+from thincam_jax.design import Polar, PowerLaw
+from thincam_jax.design.frequencies import Quadrant
+from thincam_jax.design.objectives import bayes_error, channels, ring_means
 from thincam_jax.design.response import responses, seen_part
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless import Path
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
 from thincam_jax.reconstruction import phase_pairs
 

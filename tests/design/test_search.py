@@ -7,15 +7,10 @@ import pytest
 from design.setting import HIGHEST, error, setup, two_betas
 
 from helpers import count_traces, in_full, quick
-from thincam_jax.design import (
-    DesignProblem,
-    Polar,
-    PowerLaw,
-    SearchSettings,
-    evaluate_grid,
-    find_designs,
-    random_search,
-)
+from thincam_jax.design import Polar, PowerLaw, SearchSettings, find_designs
+from thincam_jax.design.landscape import evaluate_grid
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.search import random_search
 
 SPACE = two_betas()
 DEEPEST = np.array([14.3, 29.1])

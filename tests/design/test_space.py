@@ -9,8 +9,9 @@ import pytest
 from design.setting import thesis_design, two_betas
 
 from helpers import count_traces
-from thincam_jax.design import Design, DesignSpace, Limits, Variable, shots
-from thincam_jax.design.space import active_limits
+from thincam_jax.design import DesignSpace, Variable, shots
+from thincam_jax.design.design import Design
+from thincam_jax.design.space import Limits, active_limits
 from thincam_jax.lensless.exposures import Exposures
 
 BASE = thesis_design()

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 from design import small
 
-from thincam_jax.design import (
-    DesignProblem,
-    DesignSpace,
-    Limits,
-    NonFiniteObjectiveError,
+from thincam_jax.design import DesignSpace
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.ranking import rank_trained
+from thincam_jax.design.search import NonFiniteObjectiveError, evaluate
+from thincam_jax.design.space import Limits
+from thincam_jax.design.training_search import (
     TrainingDescents,
     TrainingError,
     TrainingSettings,
+    base_point,
     build_training,
-    rank_trained,
+    start_points,
     train_designs,
     training_pixels,
-    wiener_error,
 )
-from thincam_jax.design.search import evaluate
-from thincam_jax.design.training_search import base_point, start_points
+from thincam_jax.design.wiener import wiener_error
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.reconstruction import phase_pairs
 

@@ -6,18 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import (
-    ObjectiveData,
-    Polar,
-    Quadrant,
-    Setup,
-    SignalNoise,
-    modulation_transfer,
-    objectives,
-    shots,
-    transfer,
-)
-from thincam_jax.design.objectives import Channels
+from thincam_jax.design import Polar, Setup, SignalNoise, objectives, shots, transfer
+from thincam_jax.design.frequencies import Quadrant
+from thincam_jax.design.objectives import Channels, ObjectiveData
+from thincam_jax.design.transfer import modulation_transfer
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction import phase_pairs

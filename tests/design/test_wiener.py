@@ -8,18 +8,10 @@ import pytest
 
 import thincam_jax as tc
 from helpers import count_traces
-from thincam_jax.design import (
-    Design,
-    PhotonNoise,
-    PowerLaw,
-    Setup,
-    SignalNoise,
-    TrainedSensor,
-    Training,
-    restore_by_wiener,
-    wiener_error,
-)
-from thincam_jax.design.training import channels_of
+from thincam_jax.design import PhotonNoise, PowerLaw, Setup, SignalNoise
+from thincam_jax.design.design import Design
+from thincam_jax.design.training import TrainedSensor, Training, channels_of
+from thincam_jax.design.wiener import restore_by_wiener, wiener_error
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 

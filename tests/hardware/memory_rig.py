@@ -12,24 +12,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from thincam_jax.hardware import (
-    Busy,
-    Camera,
-    CameraSettings,
-    Disconnected,
-    Display,
-    Frame,
-    Identity,
-    IncompleteFrame,
-    NotFound,
-    ProtocolError,
-    Region,
-    Stage,
-    Timeout,
-)
+from thincam_jax.hardware import Camera, CameraSettings, Display, Frame, Stage
 from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step, pictures, scene
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.errors import OutOfRange
+from thincam_jax.hardware.base import Identity, Region
+from thincam_jax.hardware.errors import (
+    Busy,
+    Disconnected,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    ProtocolError,
+    Timeout,
+)
 from thincam_jax.hardware.virtual.faults import Faults
 
 SHAPE = (6, 9)  # of sensor and display

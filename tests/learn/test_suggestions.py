@@ -10,15 +10,9 @@ from design.setting import setup, thesis_design, two_betas
 
 from helpers import finite_difference
 from thincam_jax.design import DesignSpace, Polar, PowerLaw, ResponseModel, Variable
-from thincam_jax.learn import (
-    SuggesterTraining,
-    load_suggester,
-    propose,
-    save_suggester,
-    suggest,
-    train_suggester,
-)
-from thincam_jax.learn.suggester_training import _levels
+from thincam_jax.learn import load_suggester, save_suggester, suggest
+from thincam_jax.learn.suggester_training import SuggesterTraining, _levels, train_suggester
+from thincam_jax.learn.suggestions import propose
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16

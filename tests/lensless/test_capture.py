@@ -8,7 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2, value_and_slope
-from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.lensless.forward import imaging_operator, projected_shape
 from thincam_jax.units import nm, um
 

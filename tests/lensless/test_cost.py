@@ -16,7 +16,8 @@ import pytest
 
 import thincam_jax as tc
 from helpers import ROOT
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.method import PsfMethod, psf_method
 

@@ -7,7 +7,8 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import adjoint_error, kernel_grid
+from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.lensless.field import tangents_of
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.lensless.light import fall_of_light

@@ -11,6 +11,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick, value_and_slope
+from thincam_jax.lensless.method import MODELS
 
 INF = float("inf")
 WAVELENGTH = 500e-6
@@ -125,7 +126,7 @@ def test_first_zero_of_the_fringe_scanned_response(distance, zero):
 @pytest.mark.parametrize("distance", [6.5, 5.0])
 def test_eq_3_31_and_3_49_corrected(distance):
     """From `paraxial_response`: (π/β)e^{jX}cos(πλdρ²), and the pair's difference with its X/2."""
-    from thincam_jax.lensless.propagation import paraxial_response
+    from thincam_jax.lensless.propagation.paraxial import paraxial_response
 
     beta, rho2 = 25.0, np.linspace(0.0, 900.0, 301)
     x, turn = np.pi**2 * rho2 / beta, np.cos(np.pi * WAVELENGTH * distance * rho2)
@@ -316,12 +317,12 @@ def test_impossible_distance(distance):
 def test_unknown_model_lists_the_known(evaluate, monkeypatch):
     """As a user meets it, without the type checks of the tests."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    listed = ", ".join(f"'{m}'" for m in tc.MODELS)
+    listed = ", ".join(f"'{m}'" for m in MODELS)
     with pytest.raises(
         ValueError, match=f"model = 'fraunhofer' is unknown; choose one of {listed}"
     ):
         evaluate(camera_of(), wavelength=WAVELENGTH, model="fraunhofer")
-    assert len(tc.MODELS) == 7
+    assert len(MODELS) == 7
 
 
 def test_text_for_a_length():

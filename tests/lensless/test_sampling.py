@@ -8,6 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import quick
+from thincam_jax.lensless.sampling import SamplingWarning
 from thincam_jax.units import um
 
 SCENE = tc.Scene(tc.ImagePlane(np.ones((3, 4)), distance=250.0, width=60.0), 5e-4)
@@ -29,7 +30,7 @@ def test_zones_finer_than_the_pixels_are_told_in_one_line(pitch, quiet):
         assert not caught
         return
     (told,) = caught
-    assert told.category is tc.SamplingWarning
+    assert told.category is SamplingWarning
     # βR/π = 22.4 on the mask, at M = 1 + 6.5/250 = 1.026 on the sensor.
     assert str(told.message) == (
         "the mask casts 21.8 cycles/mm on pixels that resolve 5.68 (Nyquist, 1/(2 pitch)): "

@@ -7,6 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2
+from thincam_jax.lensless.masks import maximum_length_sequence
 from thincam_jax.units import nm, um
 
 IMAGE = np.random.default_rng(0).uniform(size=(11, 14))
@@ -41,7 +42,7 @@ def test_it_is_what_the_camera_captures():
 
 
 @pytest.mark.thorough
-@pytest.mark.filterwarnings("ignore::thincam_jax.SamplingWarning")
+@pytest.mark.filterwarnings("ignore::thincam_jax.lensless.sampling.SamplingWarning")
 def test_a_mask_of_many_terms_has_an_operator():
     """Cells at random: 150 terms, 22,500 products, of which the 11 rows of the kernel leave 11."""
     open_cells = np.random.default_rng(2).integers(0, 2, (200, 150)).astype(float)
@@ -94,7 +95,7 @@ def test_what_has_no_terms_is_refused():
 )
 def test_how_many_products_a_coded_mask_needs(distance, missed):
     """The table of docs/measured/flatcam.md, per cent, by singular values of the centred PSF."""
-    code = tc.maximum_length_sequence(255)
+    code = maximum_length_sequence(255)
     mask = tc.SeparableMask(code, code, cell=30 * um, combine="xor")
     flat = tc.LenslessCamera(mask, tc.Sensor((1020, 1020), 7.5 * um), distance)
     seen = sum(

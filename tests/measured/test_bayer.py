@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from thincam_jax.measured import demosaic, demosaic_mask
-from thincam_jax.measured.bayer import PATTERNS, mosaic
+from thincam_jax.measured.bayer import PATTERNS, demosaic, demosaic_mask, mosaic
 
 
 def mosaic_of(image, pattern):

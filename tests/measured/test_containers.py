@@ -12,7 +12,9 @@ import scipy.io
 
 from thincam_jax import measured
 from thincam_jax._core import memory
-from thincam_jax.measured import CaptureFileError, read_image, unpack_raw
+from thincam_jax.measured import read_image
+from thincam_jax.measured.containers import unpack_raw
+from thincam_jax.measured.raw import CaptureFileError
 
 RNG = np.random.default_rng(0)
 COUNTS = RNG.integers(0, 4096, (14, 22), dtype=np.uint16)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thincam_jax.measured import ExposedFrames, merge_exposures
+from thincam_jax.measured.exposures import ExposedFrames, merge_exposures
 
 SHAPE = 45, 70
 FULL, OFFSET, GAIN, READ = 4095, 60.0, 0.3, 2.4  # counts, counts, counts per electron, counts

@@ -6,7 +6,9 @@ import pytest
 import skimage.transform
 
 from helpers import shared_data
-from thincam_jax.measured import CaptureFileError, Preparation, list_captures, prepare, read_image
+from thincam_jax.measured import Preparation, prepare, read_image
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import list_captures
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from thincam_jax.measured import CaptureFileError, list_captures
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import list_captures
 
 
 def save(path, shape=(4, 6)):

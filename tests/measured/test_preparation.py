@@ -7,7 +7,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from thincam_jax.measured import MeasurementError, Preparation, Raw, log_text, prepare
+from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare
+from thincam_jax.measured.write import log_text
 
 ROWS, COLUMNS = 24, 36
 BLOCKS = Preparation(capture_scale="none", downsample=2)

@@ -15,8 +15,9 @@ import tifffile
 from imagecodecs import jpeg8_encode, png_encode
 
 from thincam_jax._core import memory
-from thincam_jax.measured import CaptureFileError, Raw, read_image, read_images, read_mask
-from thincam_jax.measured.read import NonlinearWarning
+from thincam_jax.measured import Raw, read_image, read_mask
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import NonlinearWarning, read_images
 
 SHAPE = (7, 10)
 

@@ -7,16 +7,10 @@ import numpy as np
 import pytest
 
 from helpers import ROOT
-from thincam_jax.measured import (
-    ExposedFrames,
-    MeasurementError,
-    Preparation,
-    Raw,
-    SensorCalibration,
-    measure_sensor,
-    prepare,
-)
-from thincam_jax.studies import pixel_noise
+from thincam_jax.measured import MeasurementError, Preparation, Raw, measure_sensor, prepare
+from thincam_jax.measured.exposures import ExposedFrames
+from thincam_jax.measured.sensor import SensorCalibration
+from thincam_jax.studies.prepared import pixel_noise
 
 BENCHMARK = str(ROOT / "benchmarks/photon_transfer.py")
 SHAPE, FULL = (61, 90), 4095

@@ -9,7 +9,8 @@ import PIL.Image
 import pytest
 import tifffile
 
-from thincam_jax.measured import MeasurementError, log_text, read_image, to_display, write_image
+from thincam_jax.measured import MeasurementError, read_image, to_display, write_image
+from thincam_jax.measured.write import log_text
 
 IMAGE = np.random.default_rng(17).normal(size=(3, 6, 9)).astype(np.float32)
 

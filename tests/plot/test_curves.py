@@ -7,9 +7,10 @@ import pytest
 from design import small
 
 import thincam_jax as tc
-from thincam_jax.design import FreeValue, FrontPoint, Sensitivity
-from thincam_jax.design.sensitivity import Derivatives
-from thincam_jax.reconstruction import Psfs, Reconstruction
+from thincam_jax import Psfs
+from thincam_jax.design.fronts import FrontPoint
+from thincam_jax.design.sensitivity import Derivatives, FreeValue, Sensitivity
+from thincam_jax.reconstruction.result import Reconstruction
 
 matplotlib.use("Agg")
 

@@ -7,7 +7,11 @@ import pytest
 from design import small
 from studies.test_design_result import fronts
 
-from thincam_jax.design import BayesError, FreeValue, Landscape, ModulationTransfer, RankedDesign
+from thincam_jax.design import BayesError
+from thincam_jax.design.landscape import Landscape
+from thincam_jax.design.ranking import RankedDesign
+from thincam_jax.design.sensitivity import FreeValue
+from thincam_jax.design.transfer import ModulationTransfer
 from thincam_jax.plot.design import draw_fronts, draw_mtf, draw_objective, draw_responses
 from thincam_jax.studies.design import FoundDesigns
 

@@ -11,7 +11,7 @@ import skimage.io
 import thincam_jax as tc
 from thincam_jax.plot.frame import as_png
 from thincam_jax.plot.images import draw_result
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction
 
 matplotlib.use("Agg")
 RNG = np.random.default_rng(0)

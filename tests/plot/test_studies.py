@@ -11,7 +11,7 @@ import thincam_jax as tc
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
 from thincam_jax.plot.studies import _by_synthesis, _pairs_of_axes, draw_responses, enlarged_part
-from thincam_jax.studies import Limits, Response
+from thincam_jax.studies.response import Limits, Response
 
 
 @pytest.mark.parametrize(

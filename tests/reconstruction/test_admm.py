@@ -13,7 +13,8 @@ from reconstruction import dense, rig, scenes
 
 import thincam_jax as tc
 from helpers import count_traces, quick, relative_l2
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
 from thincam_jax.reconstruction import iterate as module
 from thincam_jax.reconstruction.admm import AdmmMethod, Penalties, admm_map, consensus
 from thincam_jax.reconstruction.iterate import Schedule, iterate

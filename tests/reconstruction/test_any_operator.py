@@ -28,12 +28,13 @@ from thincam_jax.imaging.operators import (
     CropConvolution,
     Masked,
     Matrix,
-    Scaled,
     Separable,
     Sparse,
     Stacked,
-    kernel_shape,
 )
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
+from thincam_jax.imaging.operators.masked import Scaled
+from thincam_jax.reconstruction import TotalVariation, solve_fixed_point
 from thincam_jax.reconstruction.admm import admm_map
 from thincam_jax.reconstruction.normal_equations import (
     DenseNormal,
@@ -46,7 +47,7 @@ from thincam_jax.reconstruction.splittings import splitting_of
 
 FIELD = (9, 12)
 TAU = 5.0
-VARIATION = tc.TotalVariation("anisotropic")
+VARIATION = TotalVariation("anisotropic")
 
 
 def operators() -> dict[str, AbstractOperator]:
@@ -202,7 +203,7 @@ def test_implicit_gradients_of_a_dense_operator():
         recording = tc.Recording(captures, Matrix(matrix, shape, (3, 11)), noise_variance=0.01)
         problem = recording.problem(tau=tau)
         start = jnp.zeros(problem.image_shape)
-        found = tc.solve_fixed_point(problem, start, iterations=5000, tolerance=1e-12)
+        found = solve_fixed_point(problem, start, iterations=5000, tolerance=1e-12)
         return jnp.vdot(where, found.image[0, 0])
 
     at = (matrix, seen, np.asarray(1.5))

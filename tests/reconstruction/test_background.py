@@ -12,6 +12,7 @@ import scipy.optimize
 import thincam_jax as tc
 from helpers import finite_difference
 from thincam_jax.imaging.operators import Matrix
+from thincam_jax.reconstruction import solve_fixed_point
 from thincam_jax.reconstruction.normal_equations import normal_equations
 from thincam_jax.reconstruction.problem import InverseProblem, gradient, objective, total_misfit
 from thincam_jax.reconstruction.ridge import solve_ridge
@@ -148,7 +149,7 @@ def test_gradients_pass_through_the_background():
         captures = (problem.captures[0].at[0, 5, 6].add(value), problem.captures[1])
         moved = eqx.tree_at(lambda p: p.captures, problem, captures)
         start = jnp.zeros(problem.image_shape)
-        found = tc.solve_fixed_point(moved, start, iterations=20000, tolerance=1e-12)
+        found = solve_fixed_point(moved, start, iterations=20000, tolerance=1e-12)
         return jnp.sum(found.image * towards)
 
     slope, one = jax.grad(projected)(0.0), jnp.asarray(1.0)

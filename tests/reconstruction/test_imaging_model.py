@@ -7,7 +7,8 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import Stacked, adjoint_error
+from thincam_jax.imaging.operators import Stacked
+from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.reconstruction.imaging_model import register, registered_shape
 from thincam_jax.units import nm, um
 

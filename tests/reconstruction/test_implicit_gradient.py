@@ -15,9 +15,14 @@ from reconstruction.test_admm import case, solved
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, relative_l2
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.reconstruction.admm import Penalties
-from thincam_jax.reconstruction.implicit_gradient import NeumannSeries, solve_fixed_point
+from thincam_jax.reconstruction.implicit_gradient import (
+    NeumannSeries,
+    implicit_proximal_gradient,
+    solve_fixed_point,
+)
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.regularisers import Cosines, Sparsity
 from thincam_jax.reconstruction.splittings import splitting_of
@@ -286,7 +291,7 @@ def sparse(tau):
 def test_with_a_proximal_map_in_closed_form_it_is_the_minimum_of_fista():
     problem, _ = sparse(0.05)
     own = solve_fista(problem, iterations=800, tolerance=1e-10)
-    image = tc.implicit_proximal_gradient(problem, zeros(problem), iterations=2000, tolerance=1e-12)
+    image = implicit_proximal_gradient(problem, zeros(problem), iterations=2000, tolerance=1e-12)
     assert relative_l2(image, own.image) < 1e-6
 
 
@@ -297,7 +302,7 @@ def test_the_implicit_derivative_is_that_of_differences():
     @jax.jit
     def error(tau):
         own = scenes.absolute(problem, tau)
-        image = tc.implicit_proximal_gradient(own, zeros(problem), iterations=2000, tolerance=1e-12)
+        image = implicit_proximal_gradient(own, zeros(problem), iterations=2000, tolerance=1e-12)
         return jnp.sum((image - truth) ** 2)
 
     tau = jnp.asarray(0.05)

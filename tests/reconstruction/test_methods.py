@@ -11,19 +11,16 @@ from reconstruction import extremes, rig, scenes
 
 import thincam_jax as tc
 from helpers import relative_l2, shared_data
-from thincam_jax.imaging.operators import Matrix, low_rank_psf
-from thincam_jax.reconstruction import (
-    SOLVERS,
-    Cosines,
-    Reconstruction,
-    Sparsity,
-    Wavelet,
-    WienerSynthesis,
-    phase_pairs,
-    separate,
-)
+from thincam_jax.imaging.operators import Matrix
+from thincam_jax.imaging.operators.low_rank import low_rank_psf
+from thincam_jax.reconstruction import TotalVariation, phase_pairs
+from thincam_jax.reconstruction.methods import SOLVERS
 from thincam_jax.reconstruction.problem import residuals
 from thincam_jax.reconstruction.recording import centred_crop
+from thincam_jax.reconstruction.regularisers import Cosines, Sparsity, Wavelet
+from thincam_jax.reconstruction.result import Reconstruction
+from thincam_jax.reconstruction.synthesis import separate
+from thincam_jax.reconstruction.wiener import WienerSynthesis
 
 RNG = np.random.default_rng(1)
 PAIR = np.array([[1.0, -1.0]])
@@ -372,7 +369,7 @@ def test_regularisers_that_a_solver_cannot_take_are_refused():
     )
     message = "tau = 'sure' is for total variation only; give a number, about 1 to 3"
     rig.refused(message, lambda: tc.Fista("sure", regulariser=Sparsity()))
-    assert tc.Fista("sure", regulariser=tc.TotalVariation()).tau == "sure"
+    assert tc.Fista("sure", regulariser=TotalVariation()).tau == "sure"
 
 
 SHAPE = (40, 41)

@@ -7,17 +7,10 @@ import pytest
 from reconstruction import dense, scenes
 
 from helpers import count_traces, finite_difference, quick
-from thincam_jax.imaging.operators import (
-    CropConvolution,
-    Masked,
-    Matrix,
-    Scaled,
-    Separable,
-    Stacked,
-    kernel_shape,
-    window_shape,
-)
+from thincam_jax.imaging.operators import CropConvolution, Masked, Matrix, Separable, Stacked
 from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     gradient,

@@ -12,14 +12,8 @@ from scipy import signal
 
 import thincam_jax as tc
 from helpers import quick, relative_l2
-from thincam_jax.imaging.operators import (
-    CropConvolution,
-    Masked,
-    Matrix,
-    Scaled,
-    Separable,
-    Stacked,
-)
+from thincam_jax.imaging.operators import CropConvolution, Masked, Matrix, Separable, Stacked
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.reconstruction import InverseProblem
 from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.problem import residuals, total_misfit, total_objective

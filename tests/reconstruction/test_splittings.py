@@ -11,7 +11,8 @@ from reconstruction import dense, scenes
 from reconstruction.test_admm import case, relaxed
 
 from helpers import finite_difference, quick, relative_l2
-from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable, Sparse, kernel_shape
+from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable, Sparse
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.reconstruction.admm import Penalties, consensus, rescaled
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import InverseProblem, gradient, uniform_image

@@ -7,13 +7,8 @@ from reconstruction import scenes
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import (
-    CropConvolution,
-    Masked,
-    Matrix,
-    ReducedMatrix,
-    kernel_shape,
-)
+from thincam_jax.imaging.operators import CropConvolution, Masked, Matrix, ReducedMatrix
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 
 FIELD, SENSOR = (9, 12), (14, 17)
 RNG = np.random.default_rng(3)

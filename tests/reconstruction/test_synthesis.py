@@ -8,8 +8,8 @@ import pytest
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.propagation.paraxial import paraxial_response
-from thincam_jax.reconstruction import contrasts, fringe_scanning, harmonics, phase_pairs, separate
-from thincam_jax.reconstruction.synthesis import phase_contrasts
+from thincam_jax.reconstruction import fringe_scanning, phase_pairs
+from thincam_jax.reconstruction.synthesis import contrasts, harmonics, phase_contrasts, separate
 from thincam_jax.units import nm, um
 
 BETA, DISTANCE, WAVELENGTH = 25.0, 6.5, 500 * nm

@@ -92,7 +92,7 @@ def test_arrays_of_other_libraries():
 
 
 def test_checked_functions_convert_them_too():
-    from thincam_jax.measured import demosaic
+    from thincam_jax.measured.bayer import demosaic
 
     mosaic = CAPTURES[0]
     expected = demosaic(mosaic, "RGGB")

@@ -13,11 +13,18 @@ from reconstruction import rig
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick, relative_l2
 from thincam_jax._core.grids import Grid
-from thincam_jax.imaging.operators import kernel_grid
-from thincam_jax.reconstruction import WienerSynthesis, fringe_scanning, phase_pairs, separate
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.reconstruction import fringe_scanning, phase_pairs
 from thincam_jax.reconstruction import wiener as module
 from thincam_jax.reconstruction.imaging_model import register
-from thincam_jax.reconstruction.wiener import crop_noise, inner_band, prior_spectrum, scene_power
+from thincam_jax.reconstruction.synthesis import separate
+from thincam_jax.reconstruction.wiener import (
+    WienerSynthesis,
+    crop_noise,
+    inner_band,
+    prior_spectrum,
+    scene_power,
+)
 from thincam_jax.units import nm, um
 
 # Scenes of this size leave their whole shadow of a mask of 1.2 mm on the sensor.

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from design import small
 
-from thincam_jax.design import FrontPoint, PhotonNoise, SignalNoise
+from thincam_jax.design import PhotonNoise, SignalNoise
+from thincam_jax.design.fronts import FrontPoint
 from thincam_jax.studies.design import Front, Fronts
 from thincam_jax.studies.design_result import summarise_fronts
 from thincam_jax.studies.design_scores import ShotNumbers, WithShots, reported_names

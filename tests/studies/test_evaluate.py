@@ -6,7 +6,7 @@ import pytest
 from studies import tiny
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.evaluate import evaluate
 
 CHART, PICTURE = 0, 1

@@ -9,9 +9,10 @@ import pytest
 from matplotlib import pyplot
 from studies import tiny_masks as tiny
 
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape
-from thincam_jax.studies import ComparedMask, ComparedScene
-from thincam_jax.studies.mask_captures import Seen, best_linear, capture
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
+from thincam_jax.studies.mask_captures import ComparedMask, Seen, best_linear, capture
+from thincam_jax.studies.mask_comparison import ComparedScene
 
 
 @pytest.mark.thorough

@@ -5,7 +5,8 @@ import pytest
 from studies import tiny
 
 import thincam_jax as tc
-from thincam_jax.studies import Method, method_response
+from thincam_jax.studies import Method
+from thincam_jax.studies.response import method_response
 
 
 @pytest.mark.parametrize(

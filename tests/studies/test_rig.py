@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from studies import tiny_screen
 
+from thincam_jax import Ridge
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators import ReducedMatrix
-from thincam_jax.reconstruction import Ridge
 from thincam_jax.studies.rig import CountingCamera, monitor_system, reconstruct_pictures
 
 

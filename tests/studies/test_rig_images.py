@@ -7,9 +7,9 @@ import pytest
 from studies import tiny
 
 import thincam_jax as tc
+from thincam_jax import AdmmTV, Wiener
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.measured.bayer import mosaic, shifted_pattern
-from thincam_jax.reconstruction import AdmmTV, Wiener
 from thincam_jax.studies.rig import scenes_of
 from thincam_jax.studies.rig_images import frame_solver, live_image
 from thincam_jax.studies.simulate import noise_free

@@ -13,6 +13,7 @@ from thincam_jax._core.quantity import FieldError
 from thincam_jax.studies.screen import ScreenModel
 from thincam_jax.studies.screen_calibration import CalibrationRun
 from thincam_jax.studies.screen_mask import ScreenMask, first_image
+from thincam_jax.waveguide.screen_to_sensor import ghost_images
 
 PLANE = wg.ObjectPlane((18, 24), OBJECT, 150.0, (6.0, 12.0))
 
@@ -46,7 +47,7 @@ def test_matrix_against_rays_through_every_part_of_the_mask():
         return np.where((np.abs(points - middle) < half).all(axis=-1), blobs(points), 0)
 
     system = ScreenMask(mask(), "geometric", points=5, tolerance=2e-3).system(camera, plane, ORDERS)
-    level = float(wg.ghost_images(camera, jnp.zeros((1, 2)), OBJECT, ORDERS).weight.sum())
+    level = float(ghost_images(camera, jnp.zeros((1, 2)), OBJECT, ORDERS).weight.sum())
     # 1.6 %, nearly all of it the mean over samples that are as wide as the spots' deviation.
     assert relative_l2(level * system(jnp.asarray(image)), traced(camera, scene)) < 0.02
     alone = ScreenMask(mask(), "geometric", points=5).system(camera, plane, ORDERS, "no_ghosts")

@@ -18,6 +18,7 @@ from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import run_study
 from thincam_jax.lensless.light import fall_of_light
+from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.studies import Method, Target
 from thincam_jax.studies.evaluate import coupled, field_shape, reconstructor
 from thincam_jax.studies.simulate import expose, noise_free, stacked
@@ -126,7 +127,7 @@ def test_any_solver_reconstructs():
 
 
 def test_total_variation_is_coupled_as_suits_the_colours():
-    solver = tc.AdmmTV(variation=tc.TotalVariation(coupling="opponent", chroma_weight=2.0))
+    solver = tc.AdmmTV(variation=TotalVariation(coupling="opponent", chroma_weight=2.0))
     found = [coupled(solver, channels).variation for channels in (1, 2, 3)]  # pyright: ignore
     assert [one.coupling for one in found] == ["none", "joint", "opponent"]
     assert jnp.all(jnp.stack([one.chroma_weight for one in found]) == 2.0)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.studies import Method, Published, Study, Target
+from thincam_jax.studies import Method, Study, Target
+from thincam_jax.studies.study import Published
 from thincam_jax.units import nm, um
 
 LIGHT: dict[str, Any] = {"wavelength": 500 * nm, "width": 2.0}

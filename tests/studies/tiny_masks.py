@@ -6,10 +6,14 @@ import jax
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax import design
-from thincam_jax.imaging.targets import point_grid, sample_image
+from thincam_jax.design.phase_mask import mask_of_phase, one_turn
+from thincam_jax.design.phase_retrieval import contour_target, retrieve_phase
+from thincam_jax.imaging.targets import sample_image
+from thincam_jax.imaging.targets.patterns import point_grid
+from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.studies import ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
+from thincam_jax.studies.mask_captures import ComparedMask, Setting
+from thincam_jax.studies.mask_comparison import ComparedScene, MaskComparison, Tuning
 from thincam_jax.units import nm, um
 
 WIDTH, DISTANCE, FIELD = 0.744, 2.0, (24, 28)
@@ -19,12 +23,12 @@ PHASES = tuple(np.arange(4) * math.pi / 2)
 
 def contours() -> tc.PhaseMask:
     """Retrieved for an object far away."""
-    blank = tc.MaskBlank((93, 93), 8 * um, 1.52)
+    blank = MaskBlank((93, 93), 8 * um, 1.52)
     key = jax.random.key(0)
-    lines = design.contour_target(key, blank.grid, feature=200 * um, line_width=24 * um)
+    lines = contour_target(key, blank.grid, feature=200 * um, line_width=24 * um)
     path = Path(*(np.asarray(n, lines.dtype) for n in (550 * nm, DISTANCE, math.inf)))
-    found = design.retrieve_phase(lines, blank.grid, path, shape=blank.shape, key=key)
-    return design.mask_of_phase(found.phase, blank, 550 * nm, design.one_turn(blank, 550 * nm))
+    found = retrieve_phase(lines, blank.grid, path, shape=blank.shape, key=key)
+    return mask_of_phase(found.phase, blank, 550 * nm, one_turn(blank, 550 * nm))
 
 
 def zones(phase: float = 0.0) -> tc.FresnelZoneAperture:

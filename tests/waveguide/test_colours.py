@@ -11,9 +11,13 @@ import scipy
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax import waveguide as wg
-from thincam_jax.imaging.operators import adjoint_error
+from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.colours import colour_system
+from thincam_jax.waveguide.efficiency import diffraction_efficiency
+from thincam_jax.waveguide.rays import pixel_centres
+from thincam_jax.waveguide.system import LitPlane
 
 RECORDED = ((633 * nm, 60 * deg), (532 * nm, 61.2 * deg), (473 * nm, 62 * deg))
 INDEX, THICKNESS, GLASS, PINHOLE, GAP, DISTANCE = 1.5, 16 * um, 5.0, 6.0, 10.0, 550.0
@@ -83,7 +87,7 @@ def test_two_gratings_of_one_film_are_coupled_waves(second, modulation, most, al
         found = both.coupled(jnp.asarray(guided), jnp.asarray(waves))[0][number][0]
         whole = np.sum(exact[number] ** 2)
         assert np.sum(np.asarray(found) ** 2) == pytest.approx(whole, rel=most)
-        by_itself = wg.diffraction_efficiency(films[number], own, jnp.asarray(waves))
+        by_itself = diffraction_efficiency(films[number], own, jnp.asarray(waves))
         assert np.sum(np.asarray(by_itself) ** 2) > whole * (1 + alone)
 
 
@@ -169,15 +173,15 @@ def test_captures_are_sums_over_wavelengths(crosstalk):
     random, films = np.random.default_rng(4), gratings()
     picture = [(random.uniform(size=12), random.uniform(size=16)) for _ in range(3)]
     both = camera(films)
-    operator = wg.colour_system(both, plane(), 2, 32, crosstalk)
+    operator = colour_system(both, plane(), 2, 32, crosstalk)
     found = operator(jnp.stack([jnp.outer(*p)[None] for p in picture]))
-    pixels = np.asarray(wg.pixel_centres(both.cameras[0])).reshape(-1, 2)
+    pixels = np.asarray(pixel_centres(both.cameras[0])).reshape(-1, 2)
     way = functools.partial(summed, both, films, crossed=crosstalk == "all")
     light, level = np.moveaxis([way(pixel, picture, 2) for pixel in pixels], 1, 0)
     expected = (light / level.mean(axis=0)).T.reshape(found.shape)
     assert relative_l2(found, expected) < 3e-3
     assert adjoint_error(operator, jax.random.key(1)) < 1e-13
-    own = wg.colour_system(both, plane(), 2, 32, "none")
+    own = colour_system(both, plane(), 2, 32, "none")
     assert relative_l2(own(jnp.stack([jnp.outer(*p)[None] for p in picture])), found) > 0.05
 
 
@@ -186,17 +190,17 @@ def test_a_plan_says_whether_cross_talk_matters():
     """True errors at most the predicted ones; sharper responses need no cross-talk."""
     sensor, picture = tc.Sensor((16, 12), 130 * um), sample_image("astronaut", linear=True)
     picture = np.moveaxis(resize(picture, (12, 16)), -1, 0)
-    lit = wg.LitPlane(plane(), picture)
+    lit = LitPlane(plane(), picture)
     edge = wg.Rectangle((0.0, 20.0), (400.0, 40.0))
     for width, tolerance, crosstalk in ((70 * nm, 3e-3, "all"), (30 * nm, 0.3, "none")):
         both = camera(sensor=sensor, responses=bands(width), bottom=edge)
         plan = wg.plan(both, lit, tolerance=tolerance)
         counts = 4, 32, "all", plan.level  # the bottom hologram ends after three
-        exact = wg.colour_system(both, plan.plane, *counts)(jnp.asarray(picture)[:, None])
+        exact = colour_system(both, plan.plane, *counts)(jnp.asarray(picture)[:, None])
         found = plan.system()(jnp.asarray(picture, plan.precision)[:, None])
         true = relative_l2(np.asarray(found, float), exact)
         assert true <= plan.predicted_error <= max(8 * true, 1e-4)
         assert plan.meets_tolerance and plan.crosstalk == crosstalk
         assert f"cross-talk  {crosstalk}: " in str(plan)
     with pytest.raises(ValueError, match=r"images are .*12, 16.*; give \(3, 'y', 'x'\), of one"):
-        wg.plan(both, wg.LitPlane(plane(), picture[0]), tolerance=0.1)
+        wg.plan(both, LitPlane(plane(), picture[0]), tolerance=0.1)

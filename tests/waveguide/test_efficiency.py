@@ -6,9 +6,13 @@ import pytest
 import scipy.integrate
 from waveguide.setting import RECORDED, hologram
 
-from thincam_jax import waveguide as wg
 from thincam_jax.units import nm
-from thincam_jax.waveguide.efficiency import _coupling, _efficiency
+from thincam_jax.waveguide.efficiency import (
+    _coupling,
+    _efficiency,
+    diffraction_efficiency,
+    ghost_weights,
+)
 
 
 def coupled_waves(film, across, wavelength, polarisation):
@@ -45,7 +49,7 @@ def test_coupled_waves(polarisation):
         across = random.uniform(-0.3, 0.3, 2)
         centre = float(film.bragg_wavelength(jnp.asarray(across))[0])
         wavelength = centre + random.uniform(-15, 15) * nm
-        found = wg.diffraction_efficiency(
+        found = diffraction_efficiency(
             film, jnp.asarray(across), jnp.asarray(wavelength), polarisation
         )
         expected = coupled_waves(film, across, wavelength, polarisation)
@@ -66,7 +70,7 @@ def test_the_mirrored_ray_against_the_diffracted_wave(modulation, apart):
         rays = (film, jnp.broadcast_to(jnp.asarray(across), (2001, 2)), jnp.asarray(wavelengths))
         strength, detuning, _, reflected = _coupling(*rays)
         other = _efficiency(strength * overlap, detuning, reflected)
-        worst = max(worst, float(abs(wg.diffraction_efficiency(*rays, "TM") - other).max()))
+        worst = max(worst, float(abs(diffraction_efficiency(*rays, "TM") - other).max()))
     assert worst == pytest.approx(apart, rel=0.03)
 
 
@@ -77,7 +81,7 @@ def test_at_normal_incidence(polarisation, peak, width):
     """The figures of the errata's film: efficiency, and full width at half its maximum, nm."""
     wavelengths = RECORDED + jnp.linspace(-10, 10, 4001) * nm
     eta = np.asarray(
-        wg.diffraction_efficiency(hologram(), jnp.zeros((4001, 2)), wavelengths, polarisation)
+        diffraction_efficiency(hologram(), jnp.zeros((4001, 2)), wavelengths, polarisation)
     )
     assert eta.max() == pytest.approx(peak, abs=5e-4)
     assert np.sum(eta > eta.max() / 2) * 0.005 == pytest.approx(width, abs=0.06)
@@ -87,14 +91,14 @@ def test_at_normal_incidence(polarisation, peak, width):
 def test_ghost_weights_are_the_integral(modulation, tails):
     """In a strong film, with narrow peaks of 1 − η, too; for few orders as for many."""
     film, across = hologram(index_modulation=modulation), jnp.array([0.05, -0.11])
-    weights = wg.ghost_weights(film, across, 4)
-    np.testing.assert_allclose(wg.ghost_weights(film, across, 1), weights[:1], rtol=1e-14)
+    weights = ghost_weights(film, across, 4)
+    np.testing.assert_allclose(ghost_weights(film, across, 1), weights[:1], rtol=1e-14)
     centre = float(film.bragg_wavelength(across)[0])
     wavelengths = centre + np.linspace(-120, 120, 48001) * nm
     total = np.zeros(4)
     for polarisation in ("TE", "TM"):
         eta = np.asarray(
-            wg.diffraction_efficiency(
+            diffraction_efficiency(
                 film, jnp.broadcast_to(across, (48001, 2)), jnp.asarray(wavelengths), polarisation
             )
         )
@@ -106,13 +110,13 @@ def test_ghost_weights_are_the_integral(modulation, tails):
 def test_extremes():
     """No light without modulation; all of it, and no NaN, with far too much."""
     across, at = jnp.zeros(2), jnp.asarray(RECORDED)
-    assert wg.diffraction_efficiency(hologram(index_modulation=0.0), across, at) == 0
+    assert diffraction_efficiency(hologram(index_modulation=0.0), across, at) == 0
     for thickness in (0.016, 1e3):
         film = hologram(index_modulation=0.2, thickness=thickness)
-        assert wg.diffraction_efficiency(film, across, at) == pytest.approx(1, abs=1e-6)
-    assert np.isfinite(wg.ghost_weights(hologram(thickness=1e3), across, 3)).all()
+        assert diffraction_efficiency(film, across, at) == pytest.approx(1, abs=1e-6)
+    assert np.isfinite(ghost_weights(hologram(thickness=1e3), across, 3)).all()
     # Far in the ultraviolet the hologram would transmit: no diffracted wave goes back.
-    assert wg.diffraction_efficiency(hologram(), across, jnp.asarray(0.3 * RECORDED)) == 0
+    assert diffraction_efficiency(hologram(), across, jnp.asarray(0.3 * RECORDED)) == 0
 
 
 def rigorous(film, across, wavelength, orders=(-1, 0, 1, 2)):
@@ -160,7 +164,7 @@ def test_rigorous_coupled_waves(modulation, kogelnik, exact):
         expected = np.array([rigorous(film, across, w) for w in wavelengths])
         rays = jnp.broadcast_to(jnp.asarray(across), (121, 2)), jnp.asarray(wavelengths)
         for phase, found in worst.items():
-            eta = np.asarray(wg.diffraction_efficiency(film, *rays, phase=phase))
+            eta = np.asarray(diffraction_efficiency(film, *rays, phase=phase))
             found.append(abs(eta - expected).max())
             assert eta.sum() == pytest.approx(expected.sum(), rel=0.01)
     assert kogelnik / 2 < max(worst["kogelnik"]) < kogelnik

@@ -10,6 +10,8 @@ from waveguide.setting import RECORDED, camera, hologram
 from helpers import ROOT
 from thincam_jax import waveguide as wg
 from thincam_jax.units import deg, um
+from thincam_jax.waveguide.rays import RayStatus
+from thincam_jax.waveguide.smear import trace_band
 
 CRITICAL = np.degrees(np.arcsin(1 / 1.5))
 PIXEL = (0.3, -0.4)
@@ -120,7 +122,7 @@ def error(name, dtype):
     expected = exact(*given)
     found = np.asarray(rays.points[..., :2], float)
     assert np.isfinite(found).all() and np.isfinite(np.asarray(rays.weight)).all()
-    band = wg.trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)
+    band = trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)
     assert all(np.isfinite(np.asarray(part)).all() for part in (band.points, band.weight))
     return np.abs(found - expected).max() / np.abs(expected).max(), set(np.asarray(rays.status))
 
@@ -153,9 +155,9 @@ def test_no_fringes(dtype):
     given = jax.tree.map(lambda leaf: jnp.asarray(leaf, DTYPES[dtype]), case(weak(0.0)))
     sts, pixel, distance = given
     rays = wg.trace(sts, jnp.stack(pixel), distance, 2)
-    assert (rays.status == wg.RayStatus.NO_BRAGG_MATCH).all()
+    assert (rays.status == RayStatus.NO_BRAGG_MATCH).all()
     assert np.isfinite(rays.points).all() and not rays.weight.any()
-    band = wg.trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)
+    band = trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)
     assert np.isfinite(band.points).all() and not band.weight.any()
 
 

@@ -7,8 +7,9 @@ import pytest
 from waveguide.setting import RECORDED, hologram
 
 from thincam_jax import waveguide as wg
+from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.units import deg, nm
-from thincam_jax.waveguide.hologram import directions
+from thincam_jax.waveguide.hologram import directions, refracted
 
 
 def cosines(count=300):
@@ -30,7 +31,7 @@ def test_recorded_light_is_matched():
     np.testing.assert_allclose(ended, [0, np.sin(55 * deg), -np.cos(55 * deg)], atol=1e-14)
 
 
-@pytest.mark.parametrize("film", [wg.bk7(), wg.CauchyIndex(1.49, 4.5e-9, (300e-6, 900e-6))])
+@pytest.mark.parametrize("film", [bk7(), CauchyIndex(1.49, 4.5e-9, (300e-6, 900e-6))])
 def test_dispersion(film):
     """The diffracted wave has the film's wavenumber, to 1e-9 nm."""
     processed = hologram(film).processed(shrinkage=0.02, index_change=0.003)
@@ -47,7 +48,7 @@ def test_dispersion(film):
 
 
 def test_where_no_wavelength_is_matched():
-    narrow = hologram(wg.CauchyIndex(1.49, 4.5e-9, (500e-6, 520e-6)))
+    narrow = hologram(CauchyIndex(1.49, 4.5e-9, (500e-6, 520e-6)))
     wavelength, found = narrow.bragg_wavelength(jnp.zeros((3, 2)))
     assert not found.any()
     assert np.isfinite(wavelength).all()
@@ -64,15 +65,15 @@ def test_shrinkage_turns_and_shortens():
 
 
 def test_refracted():
-    np.testing.assert_allclose(wg.refracted(30 * deg, 1.0, 1.5), np.arcsin(1 / 3), rtol=1e-14)
+    np.testing.assert_allclose(refracted(30 * deg, 1.0, 1.5), np.arcsin(1 / 3), rtol=1e-14)
     with pytest.raises(ValueError, match="is totally reflected.*give a smaller angle"):
-        wg.refracted(60 * deg, 1.5, 1.0)
+        refracted(60 * deg, 1.5, 1.0)
 
 
 def test_glass():
     """BK7 at the lines of its data sheet."""
     lines = jnp.array([486.1327, 587.5618, 656.2725]) * nm
-    np.testing.assert_allclose(wg.bk7()(lines), [1.52238, 1.51680, 1.51432], atol=5e-6)
+    np.testing.assert_allclose(bk7()(lines), [1.52238, 1.51680, 1.51432], atol=5e-6)
 
 
 @pytest.mark.parametrize(

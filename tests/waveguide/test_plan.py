@@ -12,10 +12,12 @@ import thincam_jax as tc
 from helpers import AS_IN_USE, in_full, relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators import Separable, Sparse
+from thincam_jax.imaging.refractive_index import CauchyIndex
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
 from thincam_jax.waveguide import planning
-from thincam_jax.waveguide.system import seen_size, smeared_rays, system_matrix
+from thincam_jax.waveguide.rays import RayStatus, pixel_centres
+from thincam_jax.waveguide.system import LitPlane, seen_size, smeared_rays, system_matrix
 
 SHAPE, CELLS = (32, 12), (24, 28)
 
@@ -36,7 +38,7 @@ def long_programs_optimised(monkeypatch):
 
 def reference(plan, plane):
     """The capture with all orders, 64 parts of each band and dispersion, in double precision."""
-    pixels = wg.pixel_centres(plan.camera)
+    pixels = pixel_centres(plan.camera)
     orders = 32 if plan.all_orders <= 32 else 48
     rays = all_optimised(plan.camera, pixels, plane, orders, 64)
     return system_matrix(rays, plane, float(seen_size(plan.camera, plane)), plan.level)
@@ -67,7 +69,7 @@ def random_case(random):
     while True:
         index = random.uniform(1.48, 1.6)
         if random.uniform() < 0.5:
-            index = wg.CauchyIndex(index, random.uniform(2e-9, 8e-9))
+            index = CauchyIndex(index, random.uniform(2e-9, 8e-9))
         film = wg.VolumeHologram.record(
             random.uniform(500, 600) * nm,
             random.uniform(-5, 5) * deg,
@@ -83,7 +85,7 @@ def random_case(random):
         sts = wg.SeeThroughCamera(screen, sensor, focal, random.uniform(2, 20))
         distance = np.exp(random.uniform(np.log(100), np.log(2000)))
         middle = wg.trace(sts, jnp.zeros(2), distance, 1)
-        if int(middle.status[0]) != wg.RayStatus.OK:
+        if int(middle.status[0]) != RayStatus.OK:
             continue
         # The bottom hologram: of any length, or of all that matters.
         first = float(middle.points[0, 1])
@@ -95,7 +97,7 @@ def random_case(random):
         centre = np.asarray(middle.points[0, :2]) + offset
         plane = wg.ObjectPlane(CELLS, distance, random.uniform(0.3, 1.3) * seen, centre)
         image = pictures()[random.integers(5)]
-        return sts, wg.LitPlane(plane, image), 10 ** random.uniform(-3.5, -0.5)
+        return sts, LitPlane(plane, image), 10 ** random.uniform(-3.5, -0.5)
 
 
 @pytest.mark.parametrize(("count", "seed"), in_full((50, 34), (200, 34)))
@@ -128,12 +130,12 @@ def test_predictions_hold_over_random_cameras(capsys, count, seed):
 
 
 def lit(shape):
-    return wg.LitPlane(wg.ObjectPlane(shape, 550.0, 150.0, (0.0, 27.0)), np.ones(shape))
+    return LitPlane(wg.ObjectPlane(shape, 550.0, 150.0, (0.0, 27.0)), np.ones(shape))
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return wg.LitPlane(lit(CELLS).plane, pictures()[0])
+    return LitPlane(lit(CELLS).plane, pictures()[0])
 
 
 def thin(glass, modulation=0.02):
@@ -162,7 +164,7 @@ def test_what_a_scene_requires(scene):
 @pytest.mark.thorough
 @pytest.mark.parametrize("tolerance", [0.03, 1e-3])
 def test_the_light_of_several_planes_adds_up(scene, tolerance):
-    near = wg.LitPlane(wg.ObjectPlane(CELLS, 250.0, 80.0, (5.0, 27.0)), pictures()[3])
+    near = LitPlane(wg.ObjectPlane(CELLS, 250.0, 80.0, (5.0, 27.0)), pictures()[3])
     plan = wg.plan(thin(5.0), [scene, near], tolerance=tolerance)
     predicted, true = errors(plan, scene, near)
     assert true <= predicted <= min(tolerance, 5 * true)
@@ -189,4 +191,4 @@ def test_errors(scene, change, error, message):
 
 def test_a_dark_image_is_refused():
     with pytest.raises(ValueError, match="image is dark, and errors are relative"):
-        wg.LitPlane(wg.ObjectPlane(CELLS, 550.0, 150.0, (0.0, 27.0)), np.zeros(CELLS))
+        LitPlane(wg.ObjectPlane(CELLS, 550.0, 150.0, (0.0, 27.0)), np.zeros(CELLS))

@@ -9,7 +9,9 @@ from waveguide.setting import camera, hologram
 
 from helpers import finite_difference, value_and_slope
 from thincam_jax import waveguide as wg
+from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.units import nm
+from thincam_jax.waveguide.rays import RayStatus, pixel_centres
 
 # Of ERRATA: pixel, wavelength in nm, Θ′ in degrees, P_0, P_1 and P_3 in mm, to its last digit.
 EXACT = [
@@ -104,7 +106,7 @@ def test_a_tracer_of_surfaces(tilt):
 @pytest.mark.thorough
 def test_single_precision_over_the_crop():
     sts = camera()
-    pixels = wg.pixel_centres(sts)[np.linspace(0, 439, 23).astype(int), ::73]
+    pixels = pixel_centres(sts)[np.linspace(0, 439, 23).astype(int), ::73]
     single, plane = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (sts, pixels))
     points = wg.trace(single, plane, jnp.float32(550.0)).points
     assert points.dtype == jnp.float32
@@ -114,7 +116,7 @@ def test_single_precision_over_the_crop():
 def test_colours_of_the_crop():
     """489 to 565 nm; the image stands on its head on the sensor, so red is at its lower rows."""
     sts = camera()
-    pixels = wg.pixel_centres(sts)[np.linspace(0, 439, 12).astype(int)][:, [0, 219, 439]]
+    pixels = pixel_centres(sts)[np.linspace(0, 439, 12).astype(int)][:, [0, 219, 439]]
     nanometres = np.asarray(wg.trace(sts, pixels, 550.0).wavelength / nm)
     assert (np.round(nanometres.min()), np.round(nanometres.max())) == (489, 565)
     rows = nanometres.mean(axis=1)
@@ -126,9 +128,9 @@ def test_guided_range():
     angles = np.radians(np.array([-29.88, -29.86, 46.26, 46.28]))
     pixels = jnp.stack([jnp.zeros(4), -6.0 * np.tan(angles)], axis=-1)
     status = np.asarray(wg.trace(camera(), pixels, 550.0, 1).status[0])
-    assert set(status[[1, 2]]) == {wg.RayStatus.OK}
-    assert wg.RayStatus.OK not in status[[0, 3]]
-    assert wg.RayStatus.NOT_GUIDED in status
+    assert set(status[[1, 2]]) == {RayStatus.OK}
+    assert RayStatus.OK not in status[[0, 3]]
+    assert RayStatus.NOT_GUIDED in status
 
 
 def numbers(sts, pixel, distance):
@@ -139,7 +141,7 @@ def numbers(sts, pixel, distance):
 @pytest.mark.parametrize(
     "pixel", [(0.0, 0.0), pytest.param((0.6, -0.9), marks=pytest.mark.thorough)]
 )
-@pytest.mark.parametrize("film", [1.5, pytest.param(wg.bk7(), marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("film", [1.5, pytest.param(bk7(), marks=pytest.mark.thorough)])
 def test_gradients(pixel, film):
     """In every number of the camera, in the pixel (on the axis too) and in the distance."""
     sts = camera(hologram(film), film)
@@ -169,21 +171,21 @@ def test_every_fault_has_a_status():
     )
     low = camera(steep, 1.5)
     rays = wg.trace(low, jnp.zeros(2), 550.0)
-    assert (rays.status == wg.RayStatus.NOT_GUIDED).all()
+    assert (rays.status == RayStatus.NOT_GUIDED).all()
     thin_glass = camera(hologram(), 1.2)
     rays = wg.trace(thin_glass, jnp.zeros(2), 550.0)
-    assert (rays.status == wg.RayStatus.EVANESCENT).all()
+    assert (rays.status == RayStatus.EVANESCENT).all()
     short = camera(bottom=wg.Rectangle((0.0, 20.0), (10.0, 30.0)))
     rays = wg.trace(short, jnp.zeros(2), 550.0)
     # Contacts at 9.1, 27.3, 45.5 and 63.7 mm; the hologram ends at 35.
-    off = wg.RayStatus.OFF_HOLOGRAM
+    off = RayStatus.OFF_HOLOGRAM
     np.testing.assert_array_equal(rays.status, [0, 0, off, off])
     assert not rays.weight[2:].any()
     aside = wg.trace(camera(), jnp.zeros(2), 550.0, 2, wg.Rectangle((0.0, 9.0), (5.0, 5.0)))
-    np.testing.assert_array_equal(aside.status, [0, wg.RayStatus.MISSED])
-    narrow = camera(hologram(wg.CauchyIndex(1.49, 4e-9, (540e-6, 600e-6))), 1.5)
+    np.testing.assert_array_equal(aside.status, [0, RayStatus.MISSED])
+    narrow = camera(hologram(CauchyIndex(1.49, 4e-9, (540e-6, 600e-6))), 1.5)
     none = wg.trace(narrow, jnp.zeros(2), 550.0)
-    assert (none.status == wg.RayStatus.NO_BRAGG_MATCH).all()
+    assert (none.status == RayStatus.NO_BRAGG_MATCH).all()
     for found in (rays, aside, none):
         assert np.isfinite(found.points).all()
         assert np.isfinite(found.weight).all()
@@ -193,5 +195,5 @@ def test_an_earlier_contact_beside_the_hologram_takes_no_light():
     """A hologram that begins after the first contact: the second is then the first ghost."""
     whole = wg.trace(camera(), jnp.zeros(2), 550.0)
     late = wg.trace(camera(bottom=wg.Rectangle((0.0, 60.0), (10.0, 80.0))), jnp.zeros(2), 550.0)
-    assert late.status[0] == wg.RayStatus.OFF_HOLOGRAM
+    assert late.status[0] == RayStatus.OFF_HOLOGRAM
     np.testing.assert_allclose(late.weight[1:], whole.weight[:-1], rtol=1e-14)

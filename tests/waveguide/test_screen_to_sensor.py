@@ -8,8 +8,12 @@ from waveguide.setting import hologram
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax import waveguide as wg
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid, low_rank_psf
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.units import um
+from thincam_jax.waveguide.efficiency import ghost_weights
+from thincam_jax.waveguide.screen_to_sensor import ghost_images, ghost_psfs
 
 ORDERS, OBJECT = 3, 550.0
 
@@ -23,7 +27,7 @@ def behind(shape=(28, 32), pitch=110 * um):
 class TestGhostImages:
     def images(self):
         field = jnp.array([[0.0, 0.0], [0.6, 0.9], [-1.05, -0.4]])
-        return wg.ghost_images(behind(), field, OBJECT, ORDERS)
+        return ghost_images(behind(), field, OBJECT, ORDERS)
 
     @pytest.mark.thorough
     def test_all_orders_see_the_same_point(self):
@@ -79,7 +83,7 @@ class TestGhostsAlone:
 
         Σ(1 − η)^i z^i = 1/(1 − (1 − η)z), whose real part on |z| = 1 is least at z = −1.
         """
-        weights = np.asarray(wg.ghost_weights(hologram(), jnp.zeros((1, 2)), 24))[:, 0]
+        weights = np.asarray(ghost_weights(hologram(), jnp.zeros((1, 2)), 24))[:, 0]
         assert (np.diff(weights) < 0).all() and (weights > 0).all()
         phase = np.linspace(0, 2 * np.pi, 721)
         transfer = np.abs(np.exp(1j * np.outer(phase, np.arange(24))) @ weights)
@@ -151,8 +155,8 @@ def test_operator_against_rays_through_every_part_of_the_mask():
             pixel_integration=True,
         )
 
-    images = wg.ghost_images(camera, field_of(camera, shape, (5, 5)), OBJECT, ORDERS)
-    psfs = wg.ghost_psfs(images, shadow)
+    images = ghost_images(camera, field_of(camera, shape, (5, 5)), OBJECT, ORDERS)
+    psfs = ghost_psfs(images, shadow)
     fit = low_rank_psf(psfs, camera.sensor.pitch, camera.sensor.shape, shape, tolerance=2e-3)
     points = wg.trace(camera, field_of(camera, shape, shape), OBJECT, 1).points[0, ..., :2]
     scene = jnp.asarray(blobs(np.asarray(points)))

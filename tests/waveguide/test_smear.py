@@ -9,8 +9,11 @@ from waveguide.setting import camera, hologram
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
-from thincam_jax.imaging.operators import adjoint_error
+from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.units import nm, um
+from thincam_jax.waveguide.efficiency import diffraction_efficiency
+from thincam_jax.waveguide.rays import pixel_centres
+from thincam_jax.waveguide.smear import trace_band
 
 PIXELS = [(0.0, 0.0), (0.0, 1.0536), (-1.0536, -1.0536)]
 
@@ -38,7 +41,7 @@ def one_wavelength(pixel, order, wavelength, index, distance=550.0, width=5.0):
     return place + gone(outside, index, width) + gone(outside, 1.0, distance)
 
 
-efficiency = eqx.filter_jit(wg.diffraction_efficiency)
+efficiency = eqx.filter_jit(diffraction_efficiency)
 
 
 def lights(across, wavelengths, orders):
@@ -58,7 +61,7 @@ def test_parts_of_the_band(number):
     """Sums, means and deciles of 4001 wavelengths weighted by η²(1−η)^i."""
     sts, film, pixel = camera(), hologram(), PIXELS[number]
     samples = 10
-    rays = wg.trace_band(sts, jnp.asarray(pixel), 550.0, 3, samples)
+    rays = trace_band(sts, jnp.asarray(pixel), 550.0, 3, samples)
     across = -np.array(pixel) / np.hypot(np.hypot(*pixel), 6.0)
     centre = float(film.bragg_wavelength(jnp.asarray(across))[0])
     wavelengths = centre + np.linspace(-80, 80, 4001) * nm
@@ -87,7 +90,7 @@ def test_the_bragg_wavelength_alone():
     pixels = jnp.asarray(PIXELS)
     narrow = camera(hologram(thickness=16.0, index_modulation=2e-5))
     narrow = eqx.tree_at(lambda c: c.tilt, narrow, jnp.array([0.03, -0.05]))
-    rays, band = wg.trace(narrow, pixels, 550.0, 2), wg.trace_band(narrow, pixels, 550.0, 2, 4)
+    rays, band = wg.trace(narrow, pixels, 550.0, 2), trace_band(narrow, pixels, 550.0, 2, 4)
     np.testing.assert_allclose(band.weight, rays.weight, rtol=1e-2)
     spread = np.abs(np.asarray(band.points) - np.asarray(rays.points)[..., None, :2])
     assert spread.max() < 0.02
@@ -97,17 +100,17 @@ def test_the_bragg_wavelength_alone():
 def test_holograms_and_critical_angle_cut_the_band():
     """At its edge a hologram keeps a part of a contact's band, and the later contacts their own."""
     pixel = jnp.zeros((1, 2))
-    whole = wg.trace_band(camera(), pixel, 550.0, 3, 4)
+    whole = trace_band(camera(), pixel, 550.0, 3, 4)
     edge = float(wg.trace(camera(), pixel, 550.0, 3).points[1, 0, 1])
     half = wg.Rectangle((0.0, edge / 2), (10.0, edge))
-    cut = wg.trace_band(camera(bottom=half), pixel, 550.0, 3, 4)
+    cut = trace_band(camera(bottom=half), pixel, 550.0, 3, 4)
     np.testing.assert_allclose(cut.weight[0], whole.weight[0], rtol=1e-12)
     assert 0.3 < float(cut.weight[1, 0] / whole.weight[1, 0]) < 0.7
     assert float(cut.points[1, ..., 1].max()) < edge + 0.01
     assert not cut.weight[2].any()
     # −29.87° is the critical angle of the Bragg wavelength: half of the band is still guided there.
     steep = jnp.array([[0.0, 6.0 * np.tan(np.radians(29.87))]])
-    part = wg.trace_band(camera(), steep, 550.0, 3, 4)
+    part = trace_band(camera(), steep, 550.0, 3, 4)
     assert 0.3 < float(part.weight[0, 0]) / 4.9e-6 < 0.8
 
 
@@ -121,7 +124,7 @@ def test_a_capture_is_the_sum_over_the_band():
     operator = wg.system_operator(sts, plane, 2, samples=20)
     assert adjoint_error(operator, jax.random.key(1)) < 1e-14
     film, expected, level = hologram(), np.zeros(sensor.shape), 0.0
-    pixels = np.asarray(wg.pixel_centres(sts))
+    pixels = np.asarray(pixel_centres(sts))
     size = 0.36 * 560 / 6
     offsets = (np.arange(60) + 0.5) / 60 * size - size / 2
     for row, column in np.ndindex(*sensor.shape):

@@ -10,9 +10,11 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import adjoint_error
+from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.refractive_index import bk7
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.rays import pixel_centres
 
 SENSOR = tc.Sensor((22, 30), 70.4 * um)
 
@@ -31,7 +33,7 @@ def test_every_pixel_is_the_sum_of_its_ghosts(shape):
     sts, seen = small(bottom=wg.Rectangle((0.0, 20.0), (60.0, 40.0))), plane(shape)
     image = np.random.default_rng(1).uniform(size=shape)
     found = np.asarray(wg.system_operator(sts, seen, 3)(jnp.asarray(image)))
-    rays = wg.trace(sts, wg.pixel_centres(sts), 550.0, 3)
+    rays = wg.trace(sts, pixel_centres(sts), 550.0, 3)
     weight = np.asarray(rays.weight)
     size = 70.4e-3 * 560 / 6
     pitch = 120.0 / shape[1]
@@ -91,7 +93,7 @@ COLOURS = ((630 * nm, 60 * deg), (532 * nm, 61.2 * deg), (460 * nm, 62.5 * deg))
 
 def in_colours(sensor=SENSOR, width=5.0):
     """The plate of BK7 with a hologram of each colour and its angle, in films shrunk by 3 %."""
-    glass = wg.bk7()
+    glass = bk7()
     made = {"index": glass, "thickness": 16 * um, "index_modulation": 0.01}
     films = [wg.VolumeHologram.record(c, 0.0, a, **made).processed(0.03) for c, a in COLOURS]
     return [wg.SeeThroughCamera(wg.Screen(f, width, glass), sensor, 6.0, 10.0) for f in films]
@@ -108,11 +110,11 @@ def test_every_colour_has_the_ghosts_of_its_wavelength():
     y = (np.arange(4096) - 2047.5) * 0.03 + 75
     steps = []
     for (colour, angle), row in zip(COLOURS, lit, strict=True):
-        recorded = 2 * np.pi * float(wg.bk7()(jnp.asarray(colour))) / colour
+        recorded = 2 * np.pi * float(bk7()(jnp.asarray(colour))) / colour
         down, along = recorded * np.sin(angle), recorded * (1 + np.cos(angle)) / 0.97
         wavelength = colour
         for _ in range(50):  # a contraction: the index changes little
-            index = float(wg.bk7()(jnp.asarray(wavelength)))
+            index = float(bk7()(jnp.asarray(wavelength)))
             wavelength = 4 * np.pi * index * along / (down**2 + along**2)
         guided = wavelength * down / (2 * np.pi)
         steps.append(2 * 20 * guided / np.sqrt(index**2 - guided**2))

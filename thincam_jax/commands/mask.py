@@ -12,16 +12,25 @@ from pydantic import Field
 from thincam_jax._core import checks
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import Length, section
-from thincam_jax.imaging.targets import load_image
+from thincam_jax.imaging.targets.images import load_image
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure
-from thincam_jax.lensless.masks.cells import Combination
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.cells import Combination, SeparableMask
+from thincam_jax.lensless.masks.display import on_display
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.masks.lenslets import LensletArray
+from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask
+from thincam_jax.lensless.masks.pinhole import Pinhole
+from thincam_jax.lensless.masks.redundant_arrays import ModifiedUniformlyRedundantArray
+from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.sampled import SampledMask, read_mask
 from thincam_jax.lensless.propagation.path import Path
 
 APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 
 
-class ApertureConfig(section(masks.FresnelZoneAperture, only=APERTURE)):
+class ApertureConfig(section(FresnelZoneAperture, only=APERTURE)):
     """Keys of all Fresnel zone apertures; `pixel_pitch`, `fill_factor`: for a display."""
 
     @pydantic.model_validator(mode="after")
@@ -37,58 +46,58 @@ Cells = Literal["mura", "ura", "mls", "random"]
 Family = Literal["fza", Cells, "pinhole", "lenslets", "file", "phase", Relief]
 
 
-def _sequences(length: int, cell: float, combine: Combination = "xor") -> masks.SeparableMask:
+def _sequences(length: int, cell: float, combine: Combination = "xor") -> SeparableMask:
     code = masks.maximum_length_sequence(length)
-    return masks.SeparableMask(code, code, cell, combine=combine)
+    return SeparableMask(code, code, cell, combine=combine)
 
 
-def _lenslets(focal_length: float, cell: float, lenses: tuple[int, int]) -> masks.LensletArray:
-    return masks.LensletArray(focal_length, cell, lenses)
+def _lenslets(focal_length: float, cell: float, lenses: tuple[int, int]) -> LensletArray:
+    return LensletArray(focal_length, cell, lenses)
 
 
-def _image(path: str, width: float) -> masks.SampledMask:
-    amplitude = masks.read_mask(path, 1.0).amplitude
-    return masks.SampledMask(amplitude, width / amplitude.shape[1])
+def _image(path: str, width: float) -> SampledMask:
+    amplitude = read_mask(path, 1.0).amplitude
+    return SampledMask(amplitude, width / amplitude.shape[1])
 
 
-def _phases(path: str, width: float) -> masks.SampledMask:
+def _phases(path: str, width: float) -> SampledMask:
     phase = (
         open_memmap(path, "r")
         if path.endswith(".npy")
         else 2 * np.pi * load_image(path, linear=True)
     )
-    return masks.SampledMask(np.exp(1j * phase), width / phase.shape[-1])
+    return SampledMask(np.exp(1j * phase), width / phase.shape[-1])
 
 
 def _contours(
-    key: int, blank: masks.MaskBlank, light: Path, *, feature: float, line_width: float
-) -> masks.PhaseMask:
-    from thincam_jax.design import contour_mask  # slow, and not needed by other masks
+    key: int, blank: MaskBlank, light: Path, *, feature: float, line_width: float
+) -> PhaseMask:
+    from thincam_jax.design.phase_mask import contour_mask  # slow, and not needed by other masks
 
     return contour_mask(key, blank, light, feature=feature, line_width=line_width)
 
 
 # What makes a mask of each family; a file gives what these need, and may give the rest.
-FAMILIES: dict[Family, Callable[..., masks.AbstractMask]] = {
-    "fza": masks.FresnelZoneAperture,
-    "mura": masks.ModifiedUniformlyRedundantArray,
+FAMILIES: dict[Family, Callable[..., AbstractMask]] = {
+    "fza": FresnelZoneAperture,
+    "mura": ModifiedUniformlyRedundantArray,
     "ura": masks.UniformlyRedundantArray,
     "mls": _sequences,
     "random": masks.random_cells,
-    "pinhole": masks.Pinhole,
+    "pinhole": Pinhole,
     "lenslets": _lenslets,
     "file": _image,
     "phase": _phases,
-    "diffuser": masks.diffuser,
-    "voronoi_fresnel": masks.voronoi_fresnel,
+    "diffuser": diffuser,
+    "voronoi_fresnel": voronoi_fresnel,
     "contours": _contours,
 }
 # Keys of a file that parameters are made of.
 _MADE_OF = {"blank": ("width", "cell", "index"), "key": ("seed",)}
 
 _ARRAYS = (
-    *(masks.ModifiedUniformlyRedundantArray, masks.UniformlyRedundantArray),
-    *(masks.LensletArray, masks.SeparableMask),
+    *(ModifiedUniformlyRedundantArray, masks.UniformlyRedundantArray),
+    *(LensletArray, SeparableMask),
 )
 # Left out where the family has none.
 _OTHERS = dict.fromkeys(("order", "orders", "focal_length", "cell")) | {"combine": "xor"}
@@ -96,7 +105,7 @@ _OTHERS = dict.fromkeys(("order", "orders", "focal_length", "cell")) | {"combine
 
 class MaskConfig(
     section(*_ARRAYS, only=tuple(_OTHERS), defaults=_OTHERS),
-    section(masks.FresnelZoneAperture, only=("height", "harmonics")),
+    section(FresnelZoneAperture, only=("height", "harmonics")),
     ApertureConfig,  # the keys of the last come first
 ):
     """The mask of a study: a Fresnel zone aperture, or of another `family` with its numbers.
@@ -173,7 +182,7 @@ class MaskConfig(
         return ", ".join([" ".join([self.family, *numbers]), *cells, f"{self.width:g} mm wide"])
 
 
-def built_mask(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
+def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
     """The mask of an exposure but for a profile of its own, on its display.
 
     **Errors**: ValueError for numbers that make none.
@@ -185,9 +194,9 @@ def built_mask(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
     parameters = inspect.signature(maker).parameters
     if "blank" in parameters:
         count = checks.whole_cells("width", config.width, "cell", config.cell or 0.0)
-        numbers["blank"] = masks.MaskBlank((count, count), config.cell or 0.0, config.index)
+        numbers["blank"] = MaskBlank((count, count), config.cell or 0.0, config.index)
     given = {name: numbers.get(name) for name in parameters}
     mask = maker(**{name: value for name, value in given.items() if value is not None})
     if config.family == "fza" or config.pixel_pitch is None:
         return mask
-    return masks.on_display(mask, config.pixel_pitch, config.fill_factor)
+    return on_display(mask, config.pixel_pitch, config.fill_factor)

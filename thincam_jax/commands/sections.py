@@ -20,13 +20,15 @@ from thincam_jax.commands.schema import (
     section,
 )
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
-from thincam_jax.imaging.targets import sample_images
+from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.lensless.exposures import PAIR, QUARTERS, Exposures
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
-from thincam_jax.reconstruction import AdmmTV, FringeScanning, TotalVariation, Wiener
+from thincam_jax.reconstruction import TotalVariation
+from thincam_jax.reconstruction.fringe_filter import FringeScanning
+from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.solver import AbstractSolver
-from thincam_jax.reconstruction.wiener import Prior
+from thincam_jax.reconstruction.wiener import Prior, Wiener
 from thincam_jax.studies.study import Method, Published, Synthesis, check_methods
 
 Found = TypeVar("Found")

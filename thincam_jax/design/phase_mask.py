@@ -37,7 +37,7 @@ from thincam_jax.design.phase_retrieval import contour_target, match_error, retr
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.stochastic import adam
 from thincam_jax.design.training import Channel, relative_error
-from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
@@ -131,10 +131,10 @@ def contour_mask(
 
     ```python
     import thincam_jax as tc
-    from thincam_jax.design import contour_mask
+    from thincam_jax.design.phase_mask import contour_mask
     from thincam_jax.lensless.propagation.path import Path
 
-    blank = tc.MaskBlank((64, 64), 0.01, 1.52)
+    blank = tc.lensless.masks.MaskBlank((64, 64), 0.01, 1.52)
     mask = contour_mask(0, blank, Path(5e-4, 5.0), feature=0.08, line_width=0.02)
     ```
     """

@@ -36,8 +36,9 @@ from thincam_jax.design.stochastic import adam
 from thincam_jax.imaging.refractive_index import AbstractIndex
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.units import deg, nm, um
-from thincam_jax.waveguide import Screen, SeeThroughCamera, VolumeHologram, trace_band
+from thincam_jax.waveguide import Screen, SeeThroughCamera, VolumeHologram
 from thincam_jax.waveguide.rays import bragg_rays
+from thincam_jax.waveguide.smear import trace_band
 
 # Points of the field along y, and along x on one side of the axis.
 _FIELD = (5, 3)

@@ -24,7 +24,8 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import Setup
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera

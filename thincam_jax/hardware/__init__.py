@@ -5,33 +5,15 @@ Every device, real or virtual, is a `Camera`, a `Stage` or a `Display`; every fa
 imports nothing of this; the libraries of the devices come with `thincam-jax[hardware]`.
 """
 
+from thincam_jax._core.names import modules_of
 from thincam_jax.hardware.acquisition.acquire import acquire as acquire
-from thincam_jax.hardware.acquisition.plan import method_b as method_b
-from thincam_jax.hardware.acquisition.plan import scene as scene
-from thincam_jax.hardware.acquisition.plan import zone_plate as zone_plate
 from thincam_jax.hardware.acquisition.read import read_acquisition as read_acquisition
-from thincam_jax.hardware.acquisition.rig import Rig as Rig
 from thincam_jax.hardware.acquisition.rig import open_rig as open_rig
-from thincam_jax.hardware.acquisition.taker import Procedure as Procedure
 from thincam_jax.hardware.base import Camera as Camera
 from thincam_jax.hardware.base import CameraSettings as CameraSettings
-from thincam_jax.hardware.base import Device as Device
 from thincam_jax.hardware.base import Display as Display
 from thincam_jax.hardware.base import Frame as Frame
-from thincam_jax.hardware.base import Identity as Identity
-from thincam_jax.hardware.base import Region as Region
 from thincam_jax.hardware.base import Stage as Stage
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels as PhaseLevels
-from thincam_jax.hardware.errors import Busy as Busy
-from thincam_jax.hardware.errors import Disconnected as Disconnected
 from thincam_jax.hardware.errors import HardwareError as HardwareError
-from thincam_jax.hardware.errors import IncompleteFrame as IncompleteFrame
-from thincam_jax.hardware.errors import NotFound as NotFound
-from thincam_jax.hardware.errors import NotHomed as NotHomed
-from thincam_jax.hardware.errors import OutOfRange as OutOfRange
-from thincam_jax.hardware.errors import PermissionDenied as PermissionDenied
-from thincam_jax.hardware.errors import ProtocolError as ProtocolError
-from thincam_jax.hardware.errors import Saturated as Saturated
-from thincam_jax.hardware.errors import Timeout as Timeout
-from thincam_jax.hardware.registry import drivers as drivers
-from thincam_jax.hardware.registry import open_device as open_device
+
+__getattr__ = modules_of(__name__)

@@ -13,7 +13,7 @@ from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
-from thincam_jax.lensless.plan import Plan, run_plan
+from thincam_jax.lensless.plan.run import Plan, run_plan
 from thincam_jax.lensless.sampling import warn_if_unresolved
 
 _ON_AXIS = (

@@ -13,13 +13,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
-from thincam_jax.imaging.operators import (
-    CropConvolution,
-    LowRank,
-    LowRankFit,
-    kernel_grid,
-    principal_psfs,
-)
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.low_rank import LowRank, LowRankFit, principal_psfs
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.light import light_over_field

@@ -13,7 +13,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.imaging.operators import CropConvolution, LowRank, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera

@@ -61,10 +61,10 @@ class AccuracyWarning(UserWarning):
 
     import thincam_jax as tc
 
-    warnings.simplefilter("ignore", tc.AccuracyWarning)
+    warnings.simplefilter("ignore", tc.lensless.AccuracyWarning)
     ```
 
-    **See also**: `PsfMethod`, `SamplingWarning`.
+    **See also**: `PsfMethod`, `lensless.sampling.SamplingWarning`.
     """
 
 
@@ -123,7 +123,7 @@ class PsfMethod:
     h = tc.psf(camera, wavelength=500 * nm, model=fine)
     ```
 
-    **See also**: `psf`, `select_model`, `MODELS`.
+    **See also**: `psf`, `select_model`.
     """
 
     model: Model = "separable"

@@ -42,14 +42,15 @@ def harmonic_otf(
 
     ```python
     import thincam_jax as tc
+    from thincam_jax.lensless.phase_shift import harmonic_otf
     from thincam_jax.units import nm, um
 
     mask = tc.FresnelZoneAperture(25.0, width=1.6, profile="binary")
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    second = tc.harmonic_otf(camera, 2, wavelength=500 * nm, object_distance=250.0)
+    second = harmonic_otf(camera, 2, wavelength=500 * nm, object_distance=250.0)
     ```
 
-    **See also**: `fringe_scanned_otf`.
+    **See also**: `lensless.phase_shift.fringe_scanned_otf`.
     """
     if int(harmonic) != harmonic or harmonic < 0:
         raise ValueError(f"harmonic = {harmonic!r}; give a whole number from 0 on")
@@ -84,15 +85,16 @@ def fringe_scanned_otf(
 
     ```python
     import thincam_jax as tc
+    from thincam_jax.lensless.phase_shift import fringe_scanned_otf
     from thincam_jax.units import nm, um
 
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    h = tc.fringe_scanned_otf(camera, wavelength=500 * nm, object_distance=250.0)
+    h = fringe_scanned_otf(camera, wavelength=500 * nm, object_distance=250.0)
     print(h.shape)  # (24, 32)
     ```
 
-    **See also**: `phase_pair_otf`, `harmonic_otf`.
+    **See also**: `lensless.phase_shift.phase_pair_otf`, `lensless.phase_shift.harmonic_otf`.
     """
     given = (wavelength, object_distance, model, pixel_integration)
     h = [_otf(with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
@@ -120,15 +122,16 @@ def phase_pair_otf(
 
     ```python
     import thincam_jax as tc
+    from thincam_jax.lensless.phase_shift import phase_pair_otf
     from thincam_jax.units import nm, um
 
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    h = tc.phase_pair_otf(camera, wavelength=500 * nm, object_distance=250.0)
+    h = phase_pair_otf(camera, wavelength=500 * nm, object_distance=250.0)
     print(h.shape)  # (24, 32)
     ```
 
-    **See also**: `fringe_scanned_otf`, `harmonic_otf`.
+    **See also**: `lensless.phase_shift.fringe_scanned_otf`, `lensless.phase_shift.harmonic_otf`.
     """
     given = (wavelength, object_distance, model, pixel_integration)
     return _otf(with_phase(camera, 0.0), *given) - _otf(with_phase(camera, 0.75), *given)

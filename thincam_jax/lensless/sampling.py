@@ -27,7 +27,7 @@ class SamplingWarning(UserWarning):
     from thincam_jax.units import nm, um
 
     mask = tc.FresnelZoneAperture(100.0, width=1.6)  # zones finer than the pixels
-    with warnings.catch_warnings(action="ignore", category=tc.SamplingWarning):
+    with warnings.catch_warnings(action="ignore", category=tc.lensless.sampling.SamplingWarning):
         camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
         h = tc.psf(camera, wavelength=500 * nm)
     ```

@@ -12,7 +12,9 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators import Separable, Truncated, kernel_grid, orthogonal_terms
+from thincam_jax.imaging.operators import Separable
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.separable import Truncated, orthogonal_terms
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
@@ -63,7 +65,7 @@ def separable_operator(
     import thincam_jax as tc
     from thincam_jax.units import nm, um
 
-    code = tc.maximum_length_sequence(15)
+    code = tc.lensless.masks.maximum_length_sequence(15)
     mask = tc.SeparableMask(code, code, cell=60 * um)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=2.0)
     scene = tc.Scene(tc.ImagePlane([[0.0, 1.0, 0.5]], distance=250.0, width=40.0), 500 * nm)
@@ -71,7 +73,7 @@ def separable_operator(
     print(found.operator.terms)  # 1
     ```
 
-    **See also**: `calibrate_separable`, `fit_separable`.
+    **See also**: `measured.calibration.calibrate_separable`, `fit_separable`.
     """
     if len(scene.planes) != 1:
         raise ValueError(

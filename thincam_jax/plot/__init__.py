@@ -7,7 +7,7 @@ What reports show of a study, a refocusing, a screen, a rig, a sweep or a traini
 of these names, such as `thincam_jax.plot.screen`; results draw their main figure by `plot()`.
 """
 
-from thincam_jax.plot.cameras import draw_psf as draw_psf
+from thincam_jax._core.names import modules_of
 from thincam_jax.plot.cameras import mask as mask
 from thincam_jax.plot.cameras import otf as otf
 from thincam_jax.plot.cameras import psf as psf
@@ -17,3 +17,5 @@ from thincam_jax.plot.curves import landscape as landscape
 from thincam_jax.plot.curves import sensitivity as sensitivity
 from thincam_jax.plot.images import capture as capture
 from thincam_jax.plot.images import compare as compare
+
+__getattr__ = modules_of(__name__)

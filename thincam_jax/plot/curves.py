@@ -8,11 +8,12 @@ import numpy as np
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import numbers
 from thincam_jax.plot.frame import Figure, new_figure
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction
 
 # The figures of reconstructions wait for no design.
 if TYPE_CHECKING:
-    from thincam_jax.design import FrontPoint, Sensitivity
+    from thincam_jax.design.fronts import FrontPoint
+    from thincam_jax.design.sensitivity import Sensitivity
 
 
 @checked

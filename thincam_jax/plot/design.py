@@ -10,15 +10,12 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.design import (
-    Design,
-    Landscape,
-    ModulationTransfer,
-    RankedDesign,
-    Shot,
-    TrainingError,
-)
+from thincam_jax.design.design import Design, Shot
+from thincam_jax.design.landscape import Landscape
+from thincam_jax.design.ranking import RankedDesign
 from thincam_jax.design.space import REPORTED
+from thincam_jax.design.training_search import TrainingError
+from thincam_jax.design.transfer import ModulationTransfer
 from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.design import FoundDesigns
 from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores

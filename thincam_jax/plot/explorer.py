@@ -20,18 +20,23 @@ from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import Quantity
 from thincam_jax.imaging.display import jpeg_bytes, png_bytes
-from thincam_jax.imaging.metrics import align, cut_off, first_common_zero, low_frequency_value, psnr
+from thincam_jax.imaging.metrics import align, psnr
+from thincam_jax.imaging.metrics.mtf import cut_off, first_common_zero, low_frequency_value
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import GaussianNoise
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.lensless import psf as psfs
-from thincam_jax.lensless.accuracy import select_model
+from thincam_jax.lensless.accuracy.select import select_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import PsfMethod, has_few_terms
 from thincam_jax.lensless.phase_shift import fringe_scanned_otf, with_phase, without_carrier
-from thincam_jax.reconstruction import Cameras, FringeScanning, Recording, Wiener, reconstruct
+from thincam_jax.reconstruction.fringe_filter import FringeScanning
+from thincam_jax.reconstruction.imaging_model import Cameras
+from thincam_jax.reconstruction.methods import reconstruct
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.wiener import Wiener
 from thincam_jax.studies.psf_accuracy import relative_error
 from thincam_jax.units import nm
 

@@ -13,7 +13,7 @@ from thincam_jax.imaging.display import eight_bit, pictures
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.plot.frame import Figure, new_figure, sheet, show_image
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction
 
 _BESIDE, _MOST = 4, 16  # images in a row, and in all, that a result shows of itself
 

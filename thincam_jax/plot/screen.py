@@ -17,6 +17,7 @@ from thincam_jax.studies.screen import ScreenResult, ScreenStudy
 from thincam_jax.studies.screen_calibration import CalibrationResult, diagonal_cells
 from thincam_jax.studies.screen_mask import MaskSystem
 from thincam_jax.units import nm
+from thincam_jax.waveguide.rays import Rays
 
 _RAYS = (
     "Side view: rays of three pixels through {}, plate (grey) and out to the object; thin lines "
@@ -68,7 +69,7 @@ def in_colour(capture: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     return encode_srgb(linear)[::-1, ::-1]
 
 
-def draw_result(result: ScreenResult, rays: wg.Rays) -> dict[str, Figure]:
+def draw_result(result: ScreenResult, rays: Rays) -> dict[str, Figure]:
     """All figures of a study, by the name of their file."""
     study, system = result.study, result.study.systems[0]
     if isinstance(system, MaskSystem):
@@ -140,7 +141,7 @@ def draw_rays(study: ScreenStudy) -> Figure:
     return figure
 
 
-def draw_field(study: ScreenStudy, rays: wg.Rays) -> Figure:
+def draw_field(study: ScreenStudy, rays: Rays) -> Figure:
     """Colour and ghost shift of every pixel, in grey with contours, and the colours as seen."""
     rows, columns = study.camera.sensor.shape
     pitch = float(study.camera.sensor.pitch)

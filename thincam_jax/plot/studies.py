@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thincam_jax.imaging.metrics import low_frequency_value
+from thincam_jax.imaging.metrics.mtf import low_frequency_value
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot.cameras import draw_psf as draw_camera_psf

@@ -109,7 +109,7 @@ class FringeScanning(AbstractSolver):
     result = tc.reconstruct(recording, tc.FringeScanning())
     ```
 
-    **See also**: `Wiener`, `fringe_scanned_otf`.
+    **See also**: `Wiener`, `lensless.phase_shift.fringe_scanned_otf`.
     """
 
     name: ClassVar[str] = "fringe_scanning"

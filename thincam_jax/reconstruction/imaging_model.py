@@ -16,7 +16,8 @@ from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity, unchecked
-from thincam_jax.imaging.operators import LowRank, Resampled, kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.low_rank import LowRank, Resampled
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import field_fit, tangents_of
 from thincam_jax.lensless.light import light_over_field

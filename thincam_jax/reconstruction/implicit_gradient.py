@@ -119,14 +119,15 @@ def solve_fixed_point(
     import jax.numpy as jnp
     import numpy as np
     import thincam_jax as tc
+    from thincam_jax.reconstruction import solve_fixed_point
 
     psf = np.random.default_rng(0).random((9, 9))
     problem = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]), noise_variance=0.01).problem()
-    found = tc.solve_fixed_point(problem, jnp.zeros(problem.image_shape), iterations=50)
+    found = solve_fixed_point(problem, jnp.zeros(problem.image_shape), iterations=50)
     print(found.image.shape)  # (1, 1, 32, 40)
     ```
 
-    **See also**: `implicit_proximal_gradient`, `AdmmTV`.
+    **See also**: `reconstruction.implicit_gradient.implicit_proximal_gradient`, `AdmmTV`.
     """
     splitting = splitting_of(problem) if isinstance(problem, InverseProblem) else problem
     solution = optx.fixed_point(
@@ -173,13 +174,14 @@ def implicit_proximal_gradient(
     import jax.numpy as jnp
     import numpy as np
     import thincam_jax as tc
+    from thincam_jax.reconstruction.implicit_gradient import implicit_proximal_gradient
 
     psf = np.random.default_rng(0).random((9, 9))
     problem = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]), noise_variance=0.01).problem()
-    image = tc.implicit_proximal_gradient(problem, jnp.zeros(problem.image_shape), iterations=20)
+    image = implicit_proximal_gradient(problem, jnp.zeros(problem.image_shape), iterations=20)
     ```
 
-    **See also**: `solve_fixed_point`, `Fista`.
+    **See also**: `reconstruction.solve_fixed_point`, `Fista`.
     """
     import jaxopt  # here, since it is slow to import
 

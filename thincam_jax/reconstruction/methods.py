@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity, whole
-from thincam_jax.imaging.operators import LowRank, Matrix, ReducedMatrix
+from thincam_jax.imaging.operators import Matrix, ReducedMatrix
+from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.coarse import coarser, finer
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
@@ -119,7 +120,7 @@ def reconstruct(
         if any(checks.is_traced(capture) for capture in recording.captures):
             raise TypeError(
                 f"{type(solver).__name__} checks its convergence between iterations: call it "
-                "outside of jit, grad and vmap, or use tc.solve_fixed_point there"
+                "outside of jit, grad and vmap, or use tc.reconstruction.solve_fixed_point there"
             )
         result = solver.solve(recording, start=start, callback=callback)
     elif start is not None or callback is not None:
@@ -284,7 +285,7 @@ class AdmmTV(AbstractRegularised):
     result = tc.reconstruct(recording, tc.AdmmTV(tau=2.0, iterations=10))
     ```
 
-    **See also**: `reconstruct`, `TotalVariation`, `Fista`.
+    **See also**: `reconstruct`, `reconstruction.TotalVariation`, `Fista`.
     """
 
     name: ClassVar[str] = "admm_tv"
@@ -412,7 +413,7 @@ class Fista(AbstractRegularised):
     result = tc.reconstruct(recording, tc.Fista(tau=2.0, iterations=10))
     ```
 
-    **See also**: `AdmmTV`, `implicit_proximal_gradient`.
+    **See also**: `AdmmTV`, `reconstruction.implicit_gradient.implicit_proximal_gradient`.
     """
 
     name: ClassVar[str] = "fista"

@@ -32,10 +32,10 @@ from thincam_jax.imaging.operators import (
     CropConvolution,
     Matrix,
     ReducedMatrix,
-    Scaled,
     Separable,
 )
 from thincam_jax.imaging.operators.crop_convolution import cut, place
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.imaging.operators.separable import SeparableModes
 from thincam_jax.reconstruction.problem import (

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Stacked
 from thincam_jax.imaging.operators.base import is_shape
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.imaging.operators.separable import Separable
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -66,7 +67,7 @@ class InverseProblem(eqx.Module):
     print(problem.image_shape)  # (1, 1, 32, 40)
     ```
 
-    **See also**: `Recording`, `solve_fixed_point`.
+    **See also**: `Recording`, `reconstruction.solve_fixed_point`.
     """
 
     operators: tuple[AbstractOperator, ...]

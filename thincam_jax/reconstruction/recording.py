@@ -16,17 +16,10 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
-from thincam_jax.imaging.operators import (
-    AbstractOperator,
-    CropConvolution,
-    Masked,
-    Scaled,
-    Stacked,
-    kernel_shape,
-    window_shape,
-)
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Stacked
 from thincam_jax.imaging.operators.base import is_shape, shapes_of
-from thincam_jax.imaging.operators.crop_convolution import cut
+from thincam_jax.imaging.operators.crop_convolution import cut, kernel_shape, window_shape
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core.precision import squared_modulus
-from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Scaled
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,

@@ -41,9 +41,9 @@ def harmonics(groups: int, steps: int, orders: Sequence[int]) -> np.ndarray:
     r"""Captures in groups of K phases 2πq/K: harmonics m of each group over the phase.
 
     For each group and m the channels Σ_q −sin(mφ_q) H_q and Σ_q cos(mφ_q) H_q, the real and
-    imaginary part of jΣ H_q e^{jmφ_q} = jK H_{-m} (see `thincam_jax.harmonic_otf`; m ± K are folded
-    into it). Constant and all other harmonics cancel. ValueError unless 0 < m < K/2: K phases
-    cannot distinguish others.
+    imaginary part of jΣ H_q e^{jmφ_q} = jK H_{-m}, into which m ± K are folded (see
+    `thincam_jax.lensless.phase_shift.harmonic_otf`). Constant and all other harmonics cancel.
+    ValueError unless 0 < m < K/2: K phases cannot distinguish others.
     """
     if not orders or not all(0 < 2 * m < steps for m in orders):
         raise ValueError(

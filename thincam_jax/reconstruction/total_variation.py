@@ -50,7 +50,7 @@ class TotalVariation(AbstractRegulariser):
 
     psf = np.random.default_rng(0).random((9, 9))
     recording = tc.Recording(np.ones((1, 3, 24, 32)), tc.Psfs(psf[None, None]))
-    colours = tc.TotalVariation(coupling="joint")  # edges of all channels in one place
+    colours = tc.reconstruction.TotalVariation(coupling="joint")  # edges of all channels at once
     result = tc.reconstruct(recording, tc.AdmmTV(variation=colours, iterations=10))
     ```
 

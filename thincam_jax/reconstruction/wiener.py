@@ -19,7 +19,8 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax._core.quantity import choice
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid, kernel_shape
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction.imaging_model import (

@@ -5,4 +5,7 @@ The names stand in `__init__.pyi`; each is imported at its first use.
 
 import lazy_loader
 
-__getattr__, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
+from thincam_jax._core.names import modules_of
+
+_names, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__ = modules_of(__name__, _names)

@@ -17,37 +17,31 @@ from jaxtyping import PRNGKeyArray
 
 from thincam_jax._core.precision import allow, cast, decimal_value, precision_of
 from thincam_jax._core.steps import Progress, Step, carry_out
-from thincam_jax.design import (
-    AbstractObjective,
-    Design,
-    DesignProblem,
-    Found,
-    FrontPoint,
-    FrontSearch,
-    Landscape,
-    ModulationTransfer,
+from thincam_jax.design import SearchSettings, find_designs
+from thincam_jax.design.design import Design
+from thincam_jax.design.fronts import FrontPoint, FrontSearch, front_point, search_order
+from thincam_jax.design.landscape import Landscape, landscape_if_any
+from thincam_jax.design.objectives import AbstractObjective
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.ranking import (
     RankedDesign,
-    Search,
-    SearchSettings,
+    distinct_designs,
+    found_name,
+    rank_designs,
+    rank_trained,
+    score_design,
+)
+from thincam_jax.design.search import Found, Search, random_search
+from thincam_jax.design.setup import PhotonNoise
+from thincam_jax.design.training_search import (
     TrainedDesigns,
     TrainingDescents,
     TrainingError,
     TrainingSettings,
     build_training,
-    distinct_designs,
-    find_designs,
-    found_name,
-    front_point,
-    modulation_transfer,
-    random_search,
-    rank_designs,
-    rank_trained,
-    score_design,
     training_pixels,
 )
-from thincam_jax.design.fronts import search_order
-from thincam_jax.design.landscape import landscape_if_any
-from thincam_jax.design.setup import PhotonNoise
+from thincam_jax.design.transfer import ModulationTransfer, modulation_transfer
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture

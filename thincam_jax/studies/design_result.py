@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thincam_jax._core.table import Table
-from thincam_jax.design import AbstractObjective, FrontPoint, RankedDesign, Shot, non_dominated
+from thincam_jax.design.design import Shot
+from thincam_jax.design.fronts import FrontPoint, non_dominated
+from thincam_jax.design.objectives import AbstractObjective
+from thincam_jax.design.ranking import RankedDesign
 from thincam_jax.design.setup import PhotonNoise, SignalNoise
 from thincam_jax.design.space import broken_limits
 from thincam_jax.studies.design import DesignStudy, FoundDesigns, Front, Fronts

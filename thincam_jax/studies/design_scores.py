@@ -6,7 +6,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from thincam_jax._core.table import Table, number
-from thincam_jax.design import FreeValue, Shot
+from thincam_jax.design.design import Shot
+from thincam_jax.design.sensitivity import FreeValue
 from thincam_jax.design.space import REPORTED
 from thincam_jax.studies.held_out import HeldOut
 from thincam_jax.studies.trials import Comparison, Spread

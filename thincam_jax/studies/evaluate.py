@@ -12,25 +12,23 @@ from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.imaging.metrics import align, psnr, resolved_element, ssim, usaf_contrast
+from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
+from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.imaging.targets import line_pair, usaf1951_elements
+from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.field import tangents_of
 from thincam_jax.lensless.light import light_over_field
-from thincam_jax.reconstruction import (
-    AdmmTV,
-    Cameras,
-    FringeScanning,
-    Reconstruction,
-    Recording,
-    Wiener,
-    reconstruct,
-)
+from thincam_jax.reconstruction.fringe_filter import FringeScanning
+from thincam_jax.reconstruction.imaging_model import Cameras
+from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
+from thincam_jax.reconstruction.wiener import Wiener
 from thincam_jax.studies.simulate import Capture, stacked
 from thincam_jax.studies.study import Method, Study, Target
 

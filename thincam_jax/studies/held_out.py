@@ -7,7 +7,8 @@ import numpy as np
 import scipy.stats
 
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.imaging.targets import resize, sample_image, sample_images
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
 from thincam_jax.studies.simulate import expose, noise_free, stacked
 from thincam_jax.studies.study import Study, Target

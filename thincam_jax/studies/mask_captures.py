@@ -12,14 +12,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import squared_modulus
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
-from thincam_jax.imaging.operators.crop_convolution import cut, place
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import cut, kernel_grid, place
 from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.psf import spectral_psf
-from thincam_jax.reconstruction import AdmmTV, Recording
+from thincam_jax.reconstruction.methods import AdmmTV
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation
 from thincam_jax.studies.study import Synthesis, synthesis_matrix

@@ -103,10 +103,10 @@ class MaskComparison:
 
     ```python
     import thincam_jax as tc
-    from thincam_jax.imaging.targets import point_grid, sample_image
-    from thincam_jax.studies import (
-        ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
-    )
+    from thincam_jax.imaging.targets import sample_image
+    from thincam_jax.imaging.targets.patterns import point_grid
+    from thincam_jax.studies.mask_captures import ComparedMask, Setting
+    from thincam_jax.studies.mask_comparison import ComparedScene, MaskComparison, Tuning
     from thincam_jax.units import nm, um
 
     field = (24, 28)

@@ -14,7 +14,10 @@ from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.operators import AbstractOperator
-from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Recording, reconstruct
+from thincam_jax.reconstruction import AbstractSolver
+from thincam_jax.reconstruction.methods import reconstruct
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.evaluate import rounded
 
 PUBLISHED = (

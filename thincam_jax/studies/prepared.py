@@ -13,24 +13,18 @@ from jaxtyping import Float
 from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.imaging.operators import window_shape
+from thincam_jax.imaging.operators.crop_convolution import window_shape
 from thincam_jax.lensless.psf import psf
-from thincam_jax.measured import MeasurementError, Prepared, Raw
-from thincam_jax.reconstruction import (
-    AbstractSolver,
-    Cameras,
-    InverseProblem,
-    Progress,
-    Psfs,
-    Reconstruction,
-    Recording,
-    reconstruct,
-)
-from thincam_jax.reconstruction.iterate import Callback
-from thincam_jax.reconstruction.methods import AbstractRegularised
+from thincam_jax.measured import MeasurementError, Raw
+from thincam_jax.measured.preparation import Prepared
+from thincam_jax.reconstruction import AbstractSolver, InverseProblem
+from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
+from thincam_jax.reconstruction.iterate import Callback, Progress
+from thincam_jax.reconstruction.methods import AbstractRegularised, reconstruct
 from thincam_jax.reconstruction.noise import demosaiced_noise, estimate_variance
 from thincam_jax.reconstruction.problem import relative_residual
-from thincam_jax.reconstruction.recording import centred_crop
+from thincam_jax.reconstruction.recording import Recording, centred_crop
+from thincam_jax.reconstruction.result import Reconstruction
 
 # Real arrays of the window's size that a reconstruction holds at its peak, for each channel.
 _WINDOWS = 28

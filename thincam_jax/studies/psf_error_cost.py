@@ -17,13 +17,13 @@ from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import kernel_shape
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
 from thincam_jax.lensless.method import Model, PsfMethod, models_of, psf_method
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
 from thincam_jax.studies.psf_accuracy import (
     PsfAccuracy,

@@ -25,7 +25,6 @@ from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import resize
 from thincam_jax.lensless.exposures import Exposure
-from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth.find import (
     DepthMap,
     FocusCurves,
@@ -41,6 +40,7 @@ from thincam_jax.reconstruction.depth.refocus import (
     axial_resolution,
     refocus_distances,
 )
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.evaluate import reconstructor, rounded, sample
 from thincam_jax.studies.simulate import Capture, expose, noise_free, stacked
 from thincam_jax.studies.study import Method, Study, Target

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thincam_jax._core.arguments import checked
-from thincam_jax.imaging.metrics import cut_off, first_common_zero
+from thincam_jax.imaging.metrics.mtf import cut_off, first_common_zero
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.phase_shift import without_carrier
 from thincam_jax.lensless.psf import otf

@@ -10,7 +10,7 @@ import numpy as np
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.table import Table, number
-from thincam_jax.reconstruction import FringeScanning
+from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.studies.evaluate import Evaluation, Resolved, Scores, evaluate_method
 from thincam_jax.studies.response import Limits, Response, method_response
 from thincam_jax.studies.simulate import take

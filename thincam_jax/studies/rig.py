@@ -20,15 +20,25 @@ from jaxtyping import Bool, Float
 from thincam_jax import waveguide as wg
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import CropConvolution, LowRank, ReducedMatrix, Sparse
+from thincam_jax.imaging.operators import CropConvolution, ReducedMatrix, Sparse
+from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.measured import calibration
 from thincam_jax.measured.bayer import Pattern, mosaic
-from thincam_jax.reconstruction import AbstractSolver, Reconstruction
+from thincam_jax.measured.calibration.alignment import (
+    Alignment,
+    MapKind,
+    fit_alignment,
+    locate_mark,
+)
+from thincam_jax.measured.calibration.captures import HadamardCaptures
+from thincam_jax.measured.calibration.system_matrix import open_matrix, stored_blocks, write_matrix
+from thincam_jax.reconstruction import AbstractSolver
 from thincam_jax.reconstruction.noise import estimate_noise
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.evaluate import as_picture, rounded, sample
 from thincam_jax.studies.pictures import Reconstructed, ScreenCaptures, reconstructed
 from thincam_jax.studies.rig_images import FrameSolver, square_field
@@ -217,7 +227,7 @@ class MeasuredMatrix:
 
 def recover_to(
     folder: Path,
-    captures: calibration.HadamardCaptures,
+    captures: HadamardCaptures,
     exact: tuple[Sparse, CountingCamera, Pixels] | None = None,
 ) -> MeasuredMatrix:
     """Recover the matrix of captures into a folder, block by block: matrix.zarr, reduced.npz.
@@ -228,15 +238,15 @@ def recover_to(
     path, shape = folder / "matrix.zarr", captures.series.object_shape
     shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
     began = time.perf_counter()
-    calibration.write_matrix(captures, path)
-    matrix = calibration.open_matrix(path)
+    write_matrix(captures, path)
+    matrix = open_matrix(path)
     ReducedMatrix.of(matrix, shape).save(folder / "reduced.npz", matrix)
     cells, pixel_count = diagonal_cells(shape), math.prod(captures.sensor_shape)
     numbers = [row * shape[1] + column for row, column in cells]
     columns = np.empty((len(cells), pixel_count), np.float32)
     known = None if exact is None else _exact_matrix(captures, *exact)
     total, count = 0.0, 0
-    for pixels, block in calibration.stored_blocks(path):
+    for pixels, block in stored_blocks(path):
         columns[:, pixels] = block[:, numbers].T
         if known is not None:
             matrix, deviation = known
@@ -272,7 +282,7 @@ def calibrated(path: Path, folder: Path) -> tuple[Any, ReducedMatrix]:
     if not path.with_name("reduced.npz").is_file():
         recover_to(folder, calibration.open_captures(path))
         path = folder / "matrix.zarr"
-    matrix = calibration.open_matrix(path)
+    matrix = open_matrix(path)
     return matrix, ReducedMatrix.load(path.with_name("reduced.npz"), matrix)
 
 
@@ -336,8 +346,8 @@ def align_display(
     frames: Float[np.ndarray, "frame y x"],
     shown: Sequence[np.ndarray],
     pitch: float,
-    kind: calibration.MapKind,
-) -> calibration.Alignment:
+    kind: MapKind,
+) -> Alignment:
     """Find a display before a study's first camera, by frames of a mark each.
 
     - `study`: its `config` has the object's width, within which marks are looked for.
@@ -357,11 +367,11 @@ def align_display(
     seen = []
     for mark in range(len(marks)):
         mean = frames[number == mark].mean(axis=0, dtype=float)
-        found = calibration.locate_mark(mean, psf, radius)
+        found = locate_mark(mean, psf, radius)
         seen.append(found and (pixel * found[0], pixel**2 * found[1]))
     on_display = pitch * (marks - middle)[:, ::-1]
     display = (shown[0].shape[0], shown[0].shape[1]), pitch
-    return calibration.fit_alignment(display, on_display, seen, kind, abs(pixel))
+    return fit_alignment(display, on_display, seen, kind, abs(pixel))
 
 
 class _KnownRows:
@@ -376,7 +386,7 @@ class _KnownRows:
 
 
 def _exact_matrix(
-    captures: calibration.HadamardCaptures, system: Sparse, camera: CountingCamera, pixels: Pixels
+    captures: HadamardCaptures, system: Sparse, camera: CountingCamera, pixels: Pixels
 ):
     """The matrix of direct simulation in counts, and the noise of each pixel's entries."""
     numbers = np.arange(math.prod(system.out_shape)).reshape(system.out_shape)

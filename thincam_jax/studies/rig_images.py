@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax.lensless.exposures import Exposures
-from thincam_jax.measured import demosaic, demosaic_mask
-from thincam_jax.measured.bayer import Pattern, colour_sites
-from thincam_jax.reconstruction import AdmmTV, Reconstruction, Recording, Wiener, reconstruct
+from thincam_jax.measured.bayer import Pattern, colour_sites, demosaic, demosaic_mask
+from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.result import Reconstruction
+from thincam_jax.reconstruction.wiener import Wiener
 from thincam_jax.studies.evaluate import as_picture, cameras_of, coupled
 from thincam_jax.studies.study import Method, Study
 

@@ -34,8 +34,10 @@ from thincam_jax.studies.pictures import (
 )
 from thincam_jax.studies.screen_mask import MaskSystem, ScreenMask, require_mask_fits
 from thincam_jax.units import deg, nm
+from thincam_jax.waveguide.colours import colour_system
 from thincam_jax.waveguide.hologram import directions
-from thincam_jax.waveguide.rays import bragg_rays
+from thincam_jax.waveguide.rays import Rays, RayStatus, bragg_rays, pixel_centres
+from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import colour_operator, seen_size, smeared_rays, system_matrix
 
 if TYPE_CHECKING:
@@ -150,10 +152,10 @@ class ScreenStudy:
         """The camera of the middle colour, green."""
         return self.cameras[len(self.cameras) // 2]
 
-    def rays(self, camera: wg.SeeThroughCamera | None = None) -> wg.Rays:
+    def rays(self, camera: wg.SeeThroughCamera | None = None) -> Rays:
         """Rays of every pixel and order of a camera; by default of `camera`."""
         camera = camera or self.camera
-        return wg.trace(camera, wg.pixel_centres(camera), self.plane.distance, self.orders)
+        return wg.trace(camera, pixel_centres(camera), self.plane.distance, self.orders)
 
     @property
     def wavelengths(self) -> np.ndarray:
@@ -166,15 +168,15 @@ class ScreenStudy:
         for camera in self.cameras:
             wg.check_screen(camera)
         # A few pixels suffice, but where none of them sees the object.
-        pixels = wg.pixel_centres(self.camera)
+        pixels = pixel_centres(self.camera)
         step = max(1, min(pixels.shape[:2]) // 20)
         for some in (pixels[::step, ::step], pixels):
             traced = wg.trace(self.camera, some, self.plane.distance, self.orders)
             status = np.asarray(traced.status)
-            if (status == wg.RayStatus.OK).any():
+            if (status == RayStatus.OK).any():
                 break
         else:
-            most = wg.RayStatus(int(np.bincount(status.ravel()).argmax())).name.lower()
+            most = RayStatus(int(np.bincount(status.ravel()).argmax())).name.lower()
             raise ValueError(
                 f"no ray from the sensor reaches the object's plane (most: "
                 f"{most.replace('_', ' ')}); see docs/guide/screen.md for what a status means"
@@ -214,7 +216,7 @@ class ScreenStudy:
         if self.responses and model.mistake in ("none", "no_ghosts"):
             orders = 1 if model.mistake == "no_ghosts" else self.orders
             camera = wg.ColourCamera(cameras, self.responses)
-            return wg.colour_system(camera, self.plane, orders, self.band_samples or 1)
+            return colour_system(camera, self.plane, orders, self.band_samples or 1)
         channels = []
         for camera in cameras:
             rays = mistaken_rays(self, camera, model.mistake)
@@ -254,24 +256,22 @@ def with_glass(camera: wg.SeeThroughCamera, thickness: float) -> wg.SeeThroughCa
     return replace(camera, screen=replace(camera.screen, glass_thickness=thickness))
 
 
-def mistaken_rays(
-    study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mistake
-) -> wg.SmearedRays:
+def mistaken_rays(study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mistake) -> SmearedRays:
     """The rays of a camera, followed with one of `MISTAKES`.
 
     **Errors**: ValueError for "grating" in a study without `recording_angles`.
     """
-    plane, pixels = study.plane, wg.pixel_centres(camera)
+    plane, pixels = study.plane, pixel_centres(camera)
     samples = None if mistake == "no_smear" else study.band_samples
     rays = smeared_rays(camera, pixels, plane, study.orders, samples)
     if mistake == "no_ghosts":
-        return wg.SmearedRays(rays.points[:1], rays.weight[:1])
+        return SmearedRays(rays.points[:1], rays.weight[:1])
     if mistake == "shift_invariant":
         middle = jnp.zeros((1, 1, 2), pixels.dtype)
         axis = smeared_rays(camera, middle, plane, study.orders, samples)
         scale = (camera.lens_distance + plane.distance) / camera.focal_distance
         points = axis.points - scale * pixels[..., None, :]
-        return wg.SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
+        return SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
     if mistake not in ("ghost_index", "grating"):
         return rays
     found = bragg_rays(camera, pixels)
@@ -422,17 +422,17 @@ class RaySummary:
         )
 
 
-def summarise_rays(study: ScreenStudy, rays: wg.Rays) -> RaySummary:
+def summarise_rays(study: ScreenStudy, rays: Rays) -> RaySummary:
     """Colours, angles of the guided light, shifts of the first ghost, and how rays ended."""
     status = np.asarray(rays.status)
     index = np.asarray(study.camera.screen.glass_index(rays.wavelength))
     sines = np.sqrt(np.sum(np.asarray(rays.guided) ** 2, axis=-1)) / index
     ranges = [np.asarray(rays.wavelength) / nm, np.arcsin(np.minimum(sines, 1)) / deg]
-    sound = status[0] == wg.RayStatus.OK
+    sound = status[0] == RayStatus.OK
     if study.orders > 1:
         shift = np.asarray(rays.points[1] - rays.points[0])
         ranges += [shift[..., 1], shift[..., 0]]
-        sound = sound & (status[1] == wg.RayStatus.OK)
+        sound = sound & (status[1] == RayStatus.OK)
     found: list[tuple[float, float] | None] = [None] * 4
     if sound.any():
         for number, values in enumerate(ranges):
@@ -440,7 +440,7 @@ def summarise_rays(study: ScreenStudy, rays: wg.Rays) -> RaySummary:
             found[number] = round(float(low), 3), round(float(high), 3)
     endings = {
         kind.name.lower(): round(100 * float(np.mean(status == kind)), 2)
-        for kind in wg.RayStatus
+        for kind in RayStatus
         if (status == kind).any()
     }
     return RaySummary(found[0], found[1], found[2], found[3], endings)

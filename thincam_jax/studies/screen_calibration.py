@@ -27,11 +27,12 @@ from thincam_jax._core.quantity import FieldError, check_fields, choice, quantit
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatrix, Scaled, Sparse
+from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatrix, Sparse
 from thincam_jax.imaging.operators.base import dtype_of
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.measured import calibration as measuring
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, Order
-from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS, QUANTITIES
+from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS, QUANTITIES, ScreenFit
 from thincam_jax.studies.evaluate import rounded
 from thincam_jax.studies.pictures import (
     Reconstructed,
@@ -277,7 +278,7 @@ class CalibrationRun:
     """A calibration step by step: `work` fills what `result` holds."""
 
     measured: SystemMatrix
-    fit: measuring.ScreenFit
+    fit: ScreenFit
 
     def __init__(self, study: ScreenStudy, calibration: Calibration, folder: Path | None = None):
         colours = len(study.cameras) > 1

@@ -21,11 +21,15 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity
-from thincam_jax.imaging.operators import Matrix, kernel_grid, low_rank_psf
+from thincam_jax.imaging.operators import Matrix
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks import AbstractMask
+from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import MODELS, Model
 from thincam_jax.lensless.psf import psf
+from thincam_jax.waveguide.screen_to_sensor import ghost_images, ghost_psfs
+from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import seen_size, system_matrix
 
 MASK_MISTAKES = ("none", "shift_invariant", "no_ghosts")
@@ -94,7 +98,7 @@ class ScreenMask:
         refuse_if_too_large("the matrix behind a mask", needed, "give fewer pixels or cells")
         points, count = field_points(field, sensor.grid.pitch, self.points), (self.points,) * 2
         orders = 1 if mistake == "no_ghosts" else orders
-        images = wg.ghost_images(camera, points, plane.distance, orders)
+        images = ghost_images(camera, points, plane.distance, orders)
         level = images.weight[:, middle, middle].sum()
         if not level > 0:
             raise ValueError("no light on the axis reaches the mask by this screen")
@@ -108,7 +112,7 @@ class ScreenMask:
             light = {"wavelength": wavelength, "object_distance": source}
             return psf(lensless, **light, model=self.model, pixel_integration=True)
 
-        psfs = wg.ghost_psfs(images, shadow) / level
+        psfs = ghost_psfs(images, shadow) / level
         if mistake == "shift_invariant":
             psfs = jnp.broadcast_to(psfs[middle, middle], (*count, *psfs.shape[2:]))
         fit = low_rank_psf(psfs, sensor.pitch, sensor.shape, field, tolerance=self.tolerance)
@@ -170,6 +174,6 @@ def first_image(
         raise ValueError("the object reaches beyond what the screen shows; give a smaller width")
     field = 2 * math.ceil(rows), 2 * math.ceil(columns)
     rays = wg.trace(camera, field_points(field, pitch), plane.distance, 1)
-    smeared = wg.SmearedRays(rays.points[..., None, :2], jnp.ones_like(rays.weight))
+    smeared = SmearedRays(rays.points[..., None, :2], jnp.ones_like(rays.weight))
     size = float(pitch) * float(np.ptp(edge) / np.ptp(places))
     return system_matrix(smeared, plane, size, 1.0), field

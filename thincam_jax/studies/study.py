@@ -24,8 +24,8 @@ from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.propagation.obliquity import psf_change
 from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.sampling import unresolved
-from thincam_jax.reconstruction import FringeScanning
 from thincam_jax.reconstruction import synthesis as syntheses
+from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.solver import AbstractSolver
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from thincam_jax._core.precision import decimal_value
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, Sensor
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruction import FringeScanning, Wiener
+from thincam_jax.reconstruction.fringe_filter import FringeScanning
+from thincam_jax.reconstruction.wiener import Wiener
 from thincam_jax.studies.study import Method, Published, Study, Target
 from thincam_jax.units import nm, um
 

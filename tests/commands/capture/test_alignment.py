@@ -13,7 +13,7 @@ from thincam_jax.commands.capture.run import build_study, picture_levels
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.study.build import picture
 from thincam_jax.hardware.virtual.optics import MonitorPose, cells_seen
-from thincam_jax.measured.calibration import Alignment
+from thincam_jax.measured.calibration.alignment import Alignment
 from thincam_jax.units import deg
 
 MASK = {"betas": ["60 rad/mm^2"], "width": "1.44 mm"}

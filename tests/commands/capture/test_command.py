@@ -29,7 +29,7 @@ from thincam_jax.hardware.registry import driver_report
 from thincam_jax.hardware.virtual import devices
 from thincam_jax.hardware.virtual.rig import pattern_number
 from thincam_jax.imaging.operators import ReducedMatrix
-from thincam_jax.measured.calibration import open_matrix, read_matrix
+from thincam_jax.measured.calibration.system_matrix import open_matrix, read_matrix
 
 
 @pytest.fixture(autouse=True)

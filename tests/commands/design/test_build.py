@@ -7,7 +7,7 @@ import pytest
 from commands.design import tiny
 
 from thincam_jax.commands.design.build import front_problems, with_shots
-from thincam_jax.design import ResolutionLimit, RobustError, Tolerances, WorstRatio
+from thincam_jax.design.objectives import ResolutionLimit, RobustError, Tolerances, WorstRatio
 
 LIGHT = "noise={read_noise: 4, electrons: 900}"
 

@@ -7,7 +7,7 @@ from commands.study import tiny
 from thincam_jax.commands.design.build import build_design
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.kinds import load_experiment
-from thincam_jax.design import Design
+from thincam_jax.design.design import Design
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.studies.design import DesignStudy
 

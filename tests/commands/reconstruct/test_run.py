@@ -15,7 +15,7 @@ from thincam_jax.commands.reconstruct.jobs import plan_jobs
 from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
 from thincam_jax.commands.reconstruct.run import Failed, Finished, run_jobs
 from thincam_jax.measured import MeasurementError, Preparation
-from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies import prepared
 
 SHORT = Recipe(iterations=16)  # steps of ten and of one

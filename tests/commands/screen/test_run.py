@@ -20,6 +20,7 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.commands.screen.run import build_cameras, build_screen, run_screen
 from thincam_jax.studies.screen_calibration import MEASURED, calibrate
+from thincam_jax.waveguide.rays import RayStatus
 
 
 def stored(path):
@@ -210,7 +211,7 @@ def test_the_shipped_file(tmp_path):
     assert {model.mistake for model in shipped.models} >= {"grating", "ghost_index"}
     (camera,) = build_cameras(shipped)
     status = wg.trace(camera, jnp.zeros(2), 550.0, 4).status
-    assert status.tolist() == [0, 0, 0, wg.RayStatus.OFF_HOLOGRAM]  # of the thesis' size
+    assert status.tolist() == [0, 0, 0, RayStatus.OFF_HOLOGRAM]  # of the thesis' size
 
 
 MASK = "mask: {beta: 6 rad/mm^2, width: 1.4 mm, distance: 6.5 mm, gap: 0.5 mm, points: 3}"

@@ -16,7 +16,8 @@ from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.sections import PictureConfig, StudyConfig, TargetConfig
 from thincam_jax.commands.study.build import read_picture
 from thincam_jax.imaging.encoding import decode_srgb
-from thincam_jax.imaging.targets import sample_image, sample_images
+from thincam_jax.imaging.targets import sample_image
+from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.studies.study import Target
 
 BASE = """\

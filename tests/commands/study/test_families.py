@@ -12,6 +12,9 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.lensless import masks as mask_room
+from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence
+from thincam_jax.lensless.masks.display import on_display
+from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
 
 HEAD, TAIL = tiny.TEXT.split("methods:")[0], "targets:" + tiny.TEXT.split("targets:")[1]
 METHOD = "{name: one, kind: wiener, synthesis: separate, shots: [{distance: 3 mm}]}"
@@ -31,13 +34,13 @@ def written(folder, mask=MURA, method=METHOD):
         ("{family: mls, length: 15, cell: 0.1 mm}", "mls"),
         (
             "{family: mls, length: 15, cell: 0.1 mm, combine: product}",
-            tc.SeparableMask(*2 * [tc.maximum_length_sequence(15)], 0.1),
+            tc.SeparableMask(*2 * [maximum_length_sequence(15)], 0.1),
         ),
         ("{family: random, width: 1.2 mm, cell: 0.1 mm, seed: 3}", "random"),
         ("{family: pinhole, width: 0.2 mm}", tc.Pinhole(0.2)),
         (
             MURA[:-1] + ", pixel_pitch: 40 um, fill_factor: 0.6}",
-            tc.on_display(tc.ModifiedUniformlyRedundantArray(13, 0.12), 0.04, 0.6),
+            on_display(tc.ModifiedUniformlyRedundantArray(13, 0.12), 0.04, 0.6),
         ),
     ],
 )
@@ -69,8 +72,8 @@ def test_phase_masks(tmp_path):
         )
         study = build_study(config)
         masks.append(study.camera(study.exposures[0]).mask)
-    blank, key = tc.MaskBlank((30, 30), 0.02, 1.5), jax.random.key(2)
-    expected = tc.voronoi_fresnel(key, blank, sites=5, focal_length=20.0, wavelength=500e-6)
+    blank, key = MaskBlank((30, 30), 0.02, 1.5), jax.random.key(2)
+    expected = voronoi_fresnel(key, blank, sites=5, focal_length=20.0, wavelength=500e-6)
     np.testing.assert_allclose(masks[1].height, expected.height)
     assert [mask.interpolation for mask in masks] == ["bilinear", "cells"]
     assert masks[0].height.shape == (30, 30) and float(masks[0].material(5e-4)) == 1.5
@@ -87,7 +90,7 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     """However many exposures there are, and for its warnings."""
     picture = Image.fromarray(np.uint8(255 * np.eye(12)))
     picture.save(tmp_path / "picture.png")
-    read, read_mask = [], mask_room.read_mask
+    read, read_mask = [], tc.read_mask
     monkeypatch.setattr(mask_room, "read_mask", lambda *a: read.append(a) or read_mask(*a))
     shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
     mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"

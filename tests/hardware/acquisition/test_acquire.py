@@ -24,30 +24,27 @@ from hardware.memory_rig import (
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
 from thincam_jax._core.files import WriteError
-from thincam_jax.hardware import (
-    CameraSettings,
-    Disconnected,
-    Frame,
-    IncompleteFrame,
-    NotFound,
-    NotHomed,
-    Region,
-    Timeout,
-)
+from thincam_jax.hardware import CameraSettings, Frame
 from thincam_jax.hardware.acquisition import journal, recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.plan import hadamard, pictures
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
+from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.displays import settle
-from thincam_jax.hardware.errors import OutOfRange, ProtocolError, Saturated
-from thincam_jax.measured.calibration import (
-    HadamardSeries,
-    open_captures,
-    recover_matrix,
-    resume_captures,
+from thincam_jax.hardware.errors import (
+    Disconnected,
+    IncompleteFrame,
+    NotFound,
+    NotHomed,
+    OutOfRange,
+    ProtocolError,
+    Saturated,
+    Timeout,
 )
+from thincam_jax.measured.calibration import HadamardSeries, open_captures, recover_matrix
+from thincam_jax.measured.calibration.captures import resume_captures
 
 QUICK = Procedure(timeout=0.001, reopen_wait=0.0)
 PLAN = fiducial_plan(20, dark_every=8)

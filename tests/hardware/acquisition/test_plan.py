@@ -6,7 +6,6 @@ import math
 import pytest
 from hardware.memory_rig import SETTINGS
 
-from thincam_jax.hardware import Region
 from thincam_jax.hardware.acquisition.plan import (
     BLACK,
     Pattern,
@@ -19,6 +18,7 @@ from thincam_jax.hardware.acquisition.plan import (
     psf_stack,
     zone_plate,
 )
+from thincam_jax.hardware.base import Region
 from thincam_jax.measured.calibration import HadamardSeries
 
 MASK = zone_plate(25.0, 5.6)

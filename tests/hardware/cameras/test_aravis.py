@@ -10,17 +10,17 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from thincam_jax.hardware import (
+from thincam_jax.hardware import CameraSettings
+from thincam_jax.hardware.base import Region
+from thincam_jax.hardware.errors import (
     Busy,
-    CameraSettings,
     Disconnected,
     IncompleteFrame,
     NotFound,
     OutOfRange,
-    Region,
     Timeout,
-    open_device,
 )
+from thincam_jax.hardware.registry import open_device
 
 FAKE = "arv-fake-gv-camera-0.8"
 needs_aravis = pytest.mark.skipif(

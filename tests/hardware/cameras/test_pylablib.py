@@ -10,19 +10,17 @@ import numpy as np
 import pytest
 from hardware.cameras import pylablib_double
 
-from thincam_jax.hardware import (
-    CameraSettings,
+from thincam_jax.hardware import CameraSettings
+from thincam_jax.hardware.base import Identity, Region
+from thincam_jax.hardware.errors import (
     Disconnected,
-    Identity,
     IncompleteFrame,
     NotFound,
     OutOfRange,
     ProtocolError,
-    Region,
     Timeout,
-    open_device,
 )
-from thincam_jax.hardware.registry import driver_report
+from thincam_jax.hardware.registry import driver_report, open_device
 
 SENSOR = 24, 40
 REGION = Region(4, 8, 12, 20)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hardware.displays.rig import Panel, PanelCamera
 
-from thincam_jax.hardware import CameraSettings, Rig
+from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition.acquire import acquire
 from thincam_jax.hardware.acquisition.plan import grey_levels
 from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.displays.grey_levels import GreyLevels, linear_levels, measured_levels
 from thincam_jax.hardware.displays.patterns import pattern_levels
 

@@ -13,8 +13,9 @@ from hardware.displays.x_server import (
 )
 from PIL import Image
 
-from thincam_jax.hardware import Disconnected, NotFound, OutOfRange, open_device
 from thincam_jax.hardware.displays.grey_levels import GreyLevels
+from thincam_jax.hardware.errors import Disconnected, NotFound, OutOfRange
+from thincam_jax.hardware.registry import open_device
 
 SIZE = 24, 40
 RANDOM = np.random.default_rng(1)

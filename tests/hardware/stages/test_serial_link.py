@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from thincam_jax.hardware import (
+from thincam_jax.hardware.errors import (
     Busy,
     Disconnected,
     NotFound,

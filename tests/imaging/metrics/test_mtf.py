@@ -10,14 +10,14 @@ import scipy.special
 from helpers import ROOT, quick, relative_l2
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import assemble
-from thincam_jax.imaging.metrics import (
+from thincam_jax.imaging.metrics.mtf import (
+    MINIMUM_COLUMNS,
     cut_off,
     first_common_zero,
     low_frequency_value,
     zero_crossings,
 )
-from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
-from thincam_jax.studies import method_response
+from thincam_jax.studies.response import method_response
 
 WAVELENGTH = 5e-4
 STEP = 0.05

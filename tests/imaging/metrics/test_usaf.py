@@ -5,8 +5,9 @@ import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.special import erf
 
-from thincam_jax.imaging.metrics import resolved_element, usaf_contrast
-from thincam_jax.imaging.targets import usaf1951, usaf1951_elements
+from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
+from thincam_jax.imaging.targets import usaf1951
+from thincam_jax.imaging.targets.usaf import usaf1951_elements
 
 ELEMENTS = usaf1951_elements(3)
 ONE_LAYER = usaf1951_elements(1)

@@ -13,11 +13,11 @@ from thincam_jax.imaging.operators import (
     CropConvolution,
     Masked,
     Matrix,
-    Scaled,
     Separable,
     Sparse,
     Stacked,
 )
+from thincam_jax.imaging.operators.masked import Scaled
 
 IN, OUT = (3, 4), (5, 2)
 

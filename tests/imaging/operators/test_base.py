@@ -8,8 +8,8 @@ import pytest
 from imaging.operators.dense import IN, NAMES, OUT, dense, dense_of, flat, numbers, operators, white
 
 from helpers import count_traces, finite_difference, quick
-from thincam_jax.imaging.operators import AbstractOperator, Matrix, Stacked, adjoint_error
-from thincam_jax.imaging.operators.base import is_shape
+from thincam_jax.imaging.operators import AbstractOperator, Matrix, Stacked
+from thincam_jax.imaging.operators.base import adjoint_error, is_shape
 
 KINDS = pytest.mark.parametrize("name", NAMES)
 # A convolution, several terms, a sparse matrix, and operators within operators.

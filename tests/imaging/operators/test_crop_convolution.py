@@ -9,7 +9,8 @@ import scipy.signal
 
 from helpers import count_traces, finite_difference, quick
 from thincam_jax._core.grids import Grid
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid, kernel_shape
 
 PITCH = 0.05
 # sensor and field with equal, odd-even and even-odd sizes, and the field smaller and larger

@@ -9,7 +9,9 @@ import scipy.signal
 from imaging.operators.dense import numbers
 
 from helpers import quick
-from thincam_jax.imaging.operators import CropConvolution, adjoint_error, kernel_shape, window_shape
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
 
 PITCH = 0.05
 

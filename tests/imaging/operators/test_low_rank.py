@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from helpers import relative_l2
-from thincam_jax.imaging.operators import CropConvolution, adjoint_error, low_rank_psf
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.reconstruction.scaled_problem import MARGIN
 
 SENSOR, FIELD, KERNEL, PITCH = (21, 26), (17, 22), (11, 13), 0.5

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from imaging.operators.dense import IN, OUT, dense, numbers
 
-from thincam_jax.imaging.operators import Masked, Matrix, Scaled, Separable, Stacked
+from thincam_jax.imaging.operators import Masked, Matrix, Separable, Stacked
+from thincam_jax.imaging.operators.masked import Scaled
 
 H = numbers((10, 12))
 VALID = np.arange(10).reshape(OUT) % 3 > 0

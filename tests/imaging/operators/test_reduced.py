@@ -12,14 +12,9 @@ from imaging.operators.dense import numbers
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import (
-    Matrix,
-    ReducedMatrix,
-    Scaled,
-    Sparse,
-    adjoint_error,
-    reduced,
-)
+from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Sparse, reduced
+from thincam_jax.imaging.operators.base import adjoint_error
+from thincam_jax.imaging.operators.masked import Scaled
 
 IN, OUT = (4, 5), (9, 11)
 H = numbers((99, 20))

@@ -7,7 +7,8 @@ import pytest
 from imaging.operators.dense import dense, numbers
 
 from helpers import finite_difference, quick, relative_l2
-from thincam_jax.imaging.operators import Separable, centred
+from thincam_jax.imaging.operators import Separable
+from thincam_jax.imaging.operators.separable import centred
 
 # sizes of capture and image for which the one and the other product comes first
 SIZES = [((6, 2), (3, 4)), ((2, 6), (4, 3)), ((1, 5), (7, 2)), ((9, 8), (1, 1))]

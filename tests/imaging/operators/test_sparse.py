@@ -9,7 +9,8 @@ import scipy.sparse
 from imaging.operators.dense import IN, OUT, dense, numbers, sparse_matrix
 from jax.experimental import sparse
 
-from thincam_jax.imaging.operators import Sparse, adjoint_error
+from thincam_jax.imaging.operators import Sparse
+from thincam_jax.imaging.operators.base import adjoint_error
 
 FORMATS = ["coo", "csr", "csc", "lil", "dia", "bsr"]
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from imaging.operators.dense import IN, dense, numbers
 
-from thincam_jax.imaging.operators import Matrix, Separable, Stacked, adjoint_error
+from thincam_jax.imaging.operators import Matrix, Separable, Stacked
+from thincam_jax.imaging.operators.base import adjoint_error
 
 LEFT, RIGHT, H = numbers((6, 3), 1), numbers((2, 4), 2), numbers((5, 12), 3)
 

@@ -8,7 +8,9 @@ import skimage.data
 import skimage.io
 import tifffile
 
-from thincam_jax.imaging.targets import load_image, resize, sample_image, sample_images
+from thincam_jax import load_image
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.imaging.targets.images import sample_images
 
 RAMP = np.linspace(0.0, 1.0, 24 * 31).reshape(24, 31)
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from thincam_jax.imaging.targets import point_grid, siemens_star, slanted_edge
+from thincam_jax.imaging.targets import siemens_star
+from thincam_jax.imaging.targets.patterns import point_grid, slanted_edge
 
 
 def coordinates(shape):

@@ -5,7 +5,8 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from thincam_jax.imaging.targets import line_pair, usaf1951, usaf1951_elements
+from thincam_jax.imaging.targets import usaf1951
+from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 
 STANDARD_WIDTH = 64.0  # mm; group -2, element 1 then has 0.25 line pairs/mm
 

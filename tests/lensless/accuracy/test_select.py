@@ -13,6 +13,8 @@ from lensless.accuracy import cameras
 import thincam_jax as tc
 from helpers import in_full, relative_l2
 from thincam_jax.lensless.accuracy.select import predict_cost, predicted_error, probe_of
+from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.lensless.masks.reliefs import diffuser
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 
@@ -398,8 +400,8 @@ def test_cost_of_any_mask_before_its_psf_is_computed():
     cost, error = predict_cost(zones, model="separable", **light)
     found = tc.predict_error(zones, model="separable", **light)
     assert (cost, error) == (found.cost, found.predicted_error)
-    blank = tc.MaskBlank((12, 12), 0.1, 1.5)
-    relief = tc.diffuser(0, blank, correlation_length=0.2, rms_slope=0.01)
+    blank = MaskBlank((12, 12), 0.1, 1.5)
+    relief = diffuser(0, blank, correlation_length=0.2, rms_slope=0.01)
     rough = tc.LenslessCamera(relief, sensor, 3.0)
     cost, error = predict_cost(rough, model="angular_spectrum", **light)
     assert error is None and cost.flops > 1e5 and cost.bytes > 1e4

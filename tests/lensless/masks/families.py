@@ -8,6 +8,11 @@ import jax
 import numpy as np
 
 import thincam_jax as tc
+from thincam_jax.lensless.masks import (
+    UniformlyRedundantArray,
+    maximum_length_sequence,
+    random_cells,
+)
 
 CELL, CENTRE = 0.03, (0.02, -0.05)
 WAVELENGTH, DISTANCE = 550e-6, 2.0
@@ -17,11 +22,11 @@ _NODES = 60, 200  # in a cell, and in a lens
 
 def masks(cell=CELL, centre=CENTRE):
     """By name."""
-    codes = tc.maximum_length_sequence(7), tc.maximum_length_sequence(15)
-    random = tc.random_cells(jax.random.key(1), 8 * cell, cell, height=5 * cell)
+    codes = maximum_length_sequence(7), maximum_length_sequence(15)
+    random = random_cells(jax.random.key(1), 8 * cell, cell, height=5 * cell)
     return {
         "mura": tc.ModifiedUniformlyRedundantArray(5, cell, tiles=(1, 2), centre=centre),
-        "ura": tc.UniformlyRedundantArray((7, 5), cell, centre=centre),
+        "ura": UniformlyRedundantArray((7, 5), cell, centre=centre),
         "product": tc.SeparableMask(*codes, cell, centre=centre),
         "xor": tc.SeparableMask(*codes, cell, combine="xor", centre=centre),
         "random": tc.SampledMask(random.amplitude, cell, centre=centre),
@@ -51,7 +56,7 @@ def redundant(rows, columns):
 
 def cells(name, mask):
     """Transmittance of every cell."""
-    codes = tc.maximum_length_sequence(7)[:, None], tc.maximum_length_sequence(15)
+    codes = maximum_length_sequence(7)[:, None], maximum_length_sequence(15)
     known = {
         "mura": lambda: np.tile(redundant(5, 5), (1, 2)),
         "ura": lambda: redundant(7, 5),

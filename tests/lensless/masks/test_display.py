@@ -8,7 +8,8 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2, value_and_slope
-from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.lensless.masks.display import on_display
+from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
 
 WAVELENGTH, DISTANCE, PITCH, FILL = 550 * nm, 2.0, 0.03, 0.64
@@ -44,17 +45,17 @@ def quadrature(cells):
 
 def test_codes_against_quadrature_over_the_open_parts():
     mask = tc.ModifiedUniformlyRedundantArray(5, 0.06, tiles=(1, 2), centre=CENTRE)
-    shown = tc.on_display(mask, PITCH, FILL)
+    shown = on_display(mask, PITCH, FILL)
     cells = np.kron(np.asarray(mask.cells), np.ones((2, 2)))
     np.testing.assert_allclose(psf(shown), quadrature(cells), rtol=1e-9, atol=1e-11)
-    whole = tc.on_display(mask, PITCH)
+    whole = on_display(mask, PITCH)
     np.testing.assert_allclose(psf(whole), psf(mask), rtol=1e-9, atol=1e-11)
 
 
 def test_many_cells_are_a_sampled_mask_with_gaps():
     """Of no few terms; `separable` is exact for it, too."""
     mask = tc.SampledMask(np.random.default_rng(1).uniform(0, 1, (6, 8)), PITCH, centre=CENTRE)
-    shown = tc.on_display(mask, PITCH, FILL)
+    shown = on_display(mask, PITCH, FILL)
     assert isinstance(shown, tc.SampledMask)
     expected = quadrature(np.asarray(mask.amplitude))
     np.testing.assert_allclose(psf(shown), expected, rtol=1e-9, atol=1e-11)
@@ -68,21 +69,19 @@ def test_many_cells_are_a_sampled_mask_with_gaps():
 def test_zones_are_those_of_a_zone_plate_with_pixels(height):
     numbers = {"width": 1.2, "height": height, "centre": CENTRE}
     own = tc.FresnelZoneAperture(25.0, 0.3, pixel_pitch=PITCH, fill_factor=FILL, **numbers)
-    shown = tc.on_display(tc.FresnelZoneAperture(25.0, 0.3, **numbers), PITCH, FILL)
+    shown = on_display(tc.FresnelZoneAperture(25.0, 0.3, **numbers), PITCH, FILL)
     np.testing.assert_allclose(psf(shown), psf(own), rtol=1e-11, atol=1e-12)
 
 
 def relief(fill):
     heights = np.random.default_rng(2).uniform(0, 1e-3, (20, 30))
     smooth = MaskBlank((20, 30), 0.06, 1.5).mask(heights, "bilinear")
-    return tc.on_display(smooth, PITCH, fill)
+    return on_display(smooth, PITCH, fill)
 
 
 @pytest.mark.parametrize(
     "shown",
-    quick(
-        [lambda fill: tc.on_display(tc.RadialMask([1.0, 0.3, 0.8], 0.2), PITCH, fill), relief], 1
-    ),
+    quick([lambda fill: on_display(tc.RadialMask([1.0, 0.3, 0.8], 0.2), PITCH, fill), relief], 1),
     ids=["rings", "relief"],
 )
 def test_gaps_take_their_part_of_the_light(shown):
@@ -98,14 +97,14 @@ def test_gaps_take_their_part_of_the_light(shown):
 def test_heights_of_a_display_are_the_reliefs_at_its_pixels():
     heights = np.random.default_rng(3).uniform(0, 1e-3, (10, 14))
     cells = tc.PhaseMask(heights, 0.06, 1.5, amplitude=heights * 900)
-    shown = tc.on_display(cells, PITCH, 0.9)
+    shown = on_display(cells, PITCH, 0.9)
     np.testing.assert_allclose(shown.height, np.kron(heights, np.ones((2, 2))), rtol=1e-9)
     np.testing.assert_allclose(shown.amplitude, np.kron(heights * 900, np.ones((2, 2))), rtol=1e-9)
     assert not shown.pure_phase and float(shown.fill_factor) == 0.9
 
 
 def test_gradients_and_vmap():
-    shown = tc.on_display(tc.FresnelZoneAperture(25.0, 0.3, width=1.2), PITCH, FILL)
+    shown = on_display(tc.FresnelZoneAperture(25.0, 0.3, width=1.2), PITCH, FILL)
 
     def total(numbers):
         where = lambda m: (m.pixel_pitch, m.fill_factor, m.mask.beta)  # noqa: E731
@@ -124,7 +123,7 @@ def test_gradients_and_vmap():
 @pytest.mark.thorough
 def test_models_and_plans():
     camera = tc.LenslessCamera(
-        tc.on_display(tc.ModifiedUniformlyRedundantArray(5, 0.06), PITCH, FILL), SENSOR, DISTANCE
+        on_display(tc.ModifiedUniformlyRedundantArray(5, 0.06), PITCH, FILL), SENSOR, DISTANCE
     )
     choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=0.3)
     exact = tc.psf(camera, wavelength=WAVELENGTH)
@@ -139,10 +138,10 @@ def test_models_and_plans():
 def test_refuses():
     mask = tc.ModifiedUniformlyRedundantArray(5, 0.06)
     with pytest.raises(ValueError, match="height = 0.3 mm is not a whole number of cells of pixel"):
-        tc.on_display(mask, 0.07)
+        on_display(mask, 0.07)
     with pytest.raises(ValueError, match="fill_factor"):
-        tc.on_display(mask, PITCH, 1.2)
+        on_display(mask, PITCH, 1.2)
     with pytest.raises(TypeError, match="on_display needs a mask of known size"):
-        jax.jit(lambda c: tc.on_display(tc.RadialMask([1.0], c), PITCH).centre)(0.3)
+        jax.jit(lambda c: on_display(tc.RadialMask([1.0], c), PITCH).centre)(0.3)
     with pytest.raises(ValueError, match="have no gaps"):
         tc.PhaseMask(np.zeros((4, 4)), 5 * um, 1.5, interpolation="bilinear", fill_factor=0.5)

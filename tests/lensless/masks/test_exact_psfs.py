@@ -12,7 +12,7 @@ from lensless.masks.families import DISTANCE, PITCH, SHAPE, WAVELENGTH
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2, value_and_slope
-from thincam_jax.imaging.operators import adjoint_error
+from thincam_jax.imaging.operators.base import adjoint_error
 
 INF = math.inf
 NAMES = tuple(families.masks())

@@ -7,6 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, value_and_slope
+from thincam_jax.lensless.masks import random_cells
 
 
 def test_round_pinhole_on_the_axis():
@@ -80,15 +81,15 @@ def test_a_lens_focuses():
 
 
 def test_random_cells():
-    mask = tc.random_cells(jax.random.key(0), 1.2, 0.03, height=0.6, open_fraction=0.3)
-    same = tc.random_cells(0, 1.2, 0.03, height=0.6, open_fraction=0.3)
+    mask = random_cells(jax.random.key(0), 1.2, 0.03, height=0.6, open_fraction=0.3)
+    same = random_cells(0, 1.2, 0.03, height=0.6, open_fraction=0.3)
     assert (same.amplitude == mask.amplitude).all()
     assert mask.amplitude.shape == (20, 40)
     assert abs(float(mask.amplitude.mean()) - 0.3) < 0.06
     # In single precision 12000 cells of 0.1 µm are some 1e-8 mm off.
-    assert tc.random_cells(jax.random.key(0), np.float32(1.2), np.float32(1e-4), height=1e-3)
+    assert random_cells(jax.random.key(0), np.float32(1.2), np.float32(1e-4), height=1e-3)
     with pytest.raises(ValueError, match=r"width = 1 mm is not a whole .* give width = 2 mm$"):
-        tc.random_cells(jax.random.key(0), 1.0, 2.0)
+        random_cells(jax.random.key(0), 1.0, 2.0)
 
 
 def test_masks_from_pictures(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 from lensless.masks.families import redundant
 
 import thincam_jax as tc
+from thincam_jax.lensless.masks import UniformlyRedundantArray, maximum_length_sequence
 
 CELL = 0.03
 
@@ -31,7 +32,7 @@ def test_mura_is_an_ideal_code(p):
 
 @pytest.mark.parametrize("orders", [(5, 3), (7, 5), (13, 11)])
 def test_ura_has_even_sidelobes(orders):
-    mask = tc.UniformlyRedundantArray(orders, CELL)
+    mask = UniformlyRedundantArray(orders, CELL)
     a, rs = np.asarray(mask.cells), orders[0] * orders[1]
     np.testing.assert_array_equal(a, redundant(*orders))
     expected = np.full(orders, (rs + 1) / 4)
@@ -43,7 +44,7 @@ def test_ura_has_even_sidelobes(orders):
 
 @pytest.mark.parametrize("length", [3, 31, 255])
 def test_maximum_length_sequence(length):
-    code = tc.maximum_length_sequence(length)
+    code = maximum_length_sequence(length)
     assert set(code) == {0.0, 1.0} and code.sum() == (length + 1) / 2
     s = 2 * code - 1
     expected = np.full(length, -1.0)
@@ -77,7 +78,7 @@ def test_noise_of_the_decoded_image():
 @pytest.mark.parametrize("length", [31, 255])
 def test_xor_of_codes_inverts_with_little_noise(length):
     """Mean of 1/|Â|² → 12/N², two thirds of it on the frequency axes."""
-    code = tc.maximum_length_sequence(length)
+    code = maximum_length_sequence(length)
     mask = tc.SeparableMask(code, code, CELL, combine="xor")
     noise = 1 / np.abs(np.fft.fft2(np.asarray(mask.cells))) ** 2
     noise[0, 0] = 0.0
@@ -103,10 +104,10 @@ def test_tiles():
         (lambda: tc.ModifiedUniformlyRedundantArray(5, -CELL), "cell = -0.03 mm is not positive"),
         (lambda: tc.ModifiedUniformlyRedundantArray(5, CELL, tiles=0), "tiles = 0; give at least"),
         (
-            lambda: tc.UniformlyRedundantArray((11, 7), CELL),
+            lambda: UniformlyRedundantArray((11, 7), CELL),
             r"orders = \(11, 7\) .* give \(7, 5\) or \(13, 11\)$",
         ),
-        (lambda: tc.maximum_length_sequence(100), "length = 100 .* give 63 or 127$"),
+        (lambda: maximum_length_sequence(100), "length = 100 .* give 63 or 127$"),
         (lambda: tc.SeparableMask([1.0, -1.0], [1.0], CELL), "rows runs from -1 to 1; give trans"),
         (lambda: tc.SeparableMask([1.0], np.eye(2), CELL), r"columns has shape \(2, 2\); give a"),
     ],

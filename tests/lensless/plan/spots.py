@@ -8,7 +8,9 @@ import numpy as np
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.lensless.masks import random_cells
 from thincam_jax.lensless.psf import psf_about_ray, spectral_psf
 from thincam_jax.units import nm, um
 
@@ -30,7 +32,7 @@ def random_case(random: np.random.Generator, kind: str):
     mask = {
         "plate": lambda: tc.FresnelZoneAperture(beta, random.uniform(0, 6), width=width),
         "mura": lambda: tc.ModifiedUniformlyRedundantArray(11, cell),
-        "random": lambda: tc.random_cells(key, 11 * cell, cell),
+        "random": lambda: random_cells(key, 11 * cell, cell),
         "phase": lambda: tc.PhaseMask(heights, cell, 1.5, interpolation="bilinear"),
     }[kind]()
     camera = tc.LenslessCamera(mask, tc.Sensor(SENSOR, pitch), distance)

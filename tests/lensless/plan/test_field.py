@@ -9,7 +9,7 @@ from lensless.plan import spots
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.lensless.psf import psf_about_ray
 from thincam_jax.units import nm, um

@@ -8,10 +8,13 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.masks import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.display import on_display
+from thincam_jax.lensless.masks.phase import MaskBlank
+from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
 from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.units import nm, um
 
@@ -20,7 +23,7 @@ MASKS = {
     "diffuser": lambda: diffuser(KEY, BLANK, correlation_length=20 * um, rms_slope=0.02),
     "lenses": lambda: voronoi_fresnel(KEY, BLANK, sites=3, focal_length=4.0, wavelength=532 * nm),
     "rings": lambda: tc.RadialMask(np.random.default_rng(0).uniform(0, 1, 12), 10 * um),
-    "display": lambda: tc.on_display(MASKS["diffuser"](), 10 * um, 0.8),
+    "display": lambda: on_display(MASKS["diffuser"](), 10 * um, 0.8),
 }
 LIGHT = tc.Spectrum(np.linspace(500, 560, 3) * nm)
 DISTANCES = (20.0, 60.0, 200.0)

@@ -8,8 +8,12 @@ from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.lensless.propagation import Path, angular_spectrum_sampling, propagate
-from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
+from thincam_jax.lensless import Path
+from thincam_jax.lensless.propagation.angular_spectrum import (
+    angular_spectrum,
+    angular_spectrum_sampling,
+    propagate,
+)
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import separable
 

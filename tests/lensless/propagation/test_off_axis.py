@@ -11,6 +11,7 @@ import thincam_jax as tc
 from helpers import count_traces
 from thincam_jax._core.precision import cast
 from thincam_jax.lensless.accuracy.lines import SparseGrid
+from thincam_jax.lensless.masks import random_cells
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
@@ -179,7 +180,7 @@ def test_cells_are_within_a_percent_along_an_axis(angle, most, axis):
         (tc.ModifiedUniformlyRedundantArray(11, cell=62 * um), 17),
         pytest.param(tc.RadialMask([1, 0, 1], 0.11), 17, marks=pytest.mark.thorough),
         # Of more terms than are squared one by one; no warning of the closed form's average.
-        pytest.param(tc.random_cells(0, 0.65, 5 * um), 35, marks=pytest.mark.thorough),
+        pytest.param(random_cells(0, 0.65, 5 * um), 35, marks=pytest.mark.thorough),
     ],
 )
 def test_edges_without_a_closed_form_are_sampled(mask, most):

@@ -7,7 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import separable
 

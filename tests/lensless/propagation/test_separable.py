@@ -12,8 +12,8 @@ from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
+from thincam_jax.lensless import Path
 from thincam_jax.lensless.method import PIXEL_NODES
-from thincam_jax.lensless.propagation import Path
 from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes, separable
 
 INF = float("inf")

@@ -8,7 +8,7 @@ import scipy.integrate
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick, relative_l2, value_and_slope
-from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless import Path
 from thincam_jax.lensless.propagation.separable_transfer import overlaps, transfer_factors
 
 INF = float("inf")

@@ -5,7 +5,7 @@ import pytest
 import scipy
 
 from thincam_jax.measured import MeasurementError
-from thincam_jax.measured.calibration import Alignment, fit_alignment, locate_mark
+from thincam_jax.measured.calibration.alignment import Alignment, fit_alignment, locate_mark
 
 SHAPE, WIDE = (40, 56), (72, 88)  # of a frame and of a PSF: ±16 pixels to search
 DISPLAY = (60, 80), 0.5

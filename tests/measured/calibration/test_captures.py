@@ -8,13 +8,12 @@ import zarr
 from ome_zarr_models.v05.image import Image
 
 from thincam_jax.measured.calibration import (
-    CaptureStoreError,
     HadamardSeries,
     create_captures,
     open_captures,
     recover_matrix,
-    resume_captures,
 )
+from thincam_jax.measured.calibration.captures import CaptureStoreError, resume_captures
 
 SERIES = HadamardSeries((4, 8), "natural", "binary", dark_frames=3)
 SHAPE = (5, 7)

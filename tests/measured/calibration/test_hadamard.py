@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import scipy
 
-from thincam_jax.measured.calibration import HadamardSeries, hadamard_pattern, walsh_hadamard
+from thincam_jax.measured.calibration import HadamardSeries
+from thincam_jax.measured.calibration.hadamard import hadamard_pattern, walsh_hadamard
 
 
 def patterns(shape, order):

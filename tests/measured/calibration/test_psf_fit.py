@@ -9,9 +9,10 @@ import pytest
 import scipy.ndimage
 
 import thincam_jax as tc
-from thincam_jax.measured.calibration import PsfSearch, fit_psf, problem
+from thincam_jax import fit_psf
+from thincam_jax.measured.calibration import problem
 from thincam_jax.measured.calibration.psf_fit import FRINGE_SCANNED
-from thincam_jax.measured.calibration.start import _one_picture
+from thincam_jax.measured.calibration.start import PsfSearch, _one_picture
 from thincam_jax.units import nm, um
 
 LIGHT = {"object_distance": 100.0, "wavelength": 500 * nm}

@@ -13,8 +13,10 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.measured.calibration import GhostPositions, fit_screen
+from thincam_jax.measured.calibration import fit_screen
+from thincam_jax.measured.calibration.screen_fit import GhostPositions
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.smear import trace_band
 
 CELLS = (8, 16)
 
@@ -50,7 +52,7 @@ def ghosts(deviation, true=TRUE, orders=3, leaning=(0.0, 0.0)):
     random = np.random.default_rng(0)
     pixels = random.uniform(-1, 1, (12, 2))
     sts = eqx.tree_at(lambda c: c.tilt, camera(**true), jnp.asarray(leaning))
-    seen = wg.trace_band(sts, jnp.asarray(pixels), 550.0, orders, 1).points[:, :, 0]
+    seen = trace_band(sts, jnp.asarray(pixels), 550.0, orders, 1).points[:, :, 0]
     points = (np.asarray(seen) - CENTRE).reshape(-1, 2)
     noisy = points + deviation * random.normal(size=points.shape)
     return GhostPositions(

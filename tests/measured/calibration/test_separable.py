@@ -8,7 +8,8 @@ import pytest
 import scipy.ndimage
 
 from helpers import relative_l2
-from thincam_jax.imaging.operators import Separable, centred
+from thincam_jax.imaging.operators import Separable
+from thincam_jax.imaging.operators.separable import centred
 from thincam_jax.measured.calibration.hadamard import hadamard_pattern
 from thincam_jax.measured.calibration.separable import calibrate_separable, fit_separable
 

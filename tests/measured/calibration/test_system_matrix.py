@@ -12,13 +12,15 @@ from helpers import full_disk
 from thincam_jax._core.files import WriteError
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration import (
-    CaptureStoreError,
     HadamardSeries,
     create_captures,
-    matrix_blocks,
-    read_matrix,
     recover_matrix,
     simulate_captures,
+)
+from thincam_jax.measured.calibration.captures import CaptureStoreError
+from thincam_jax.measured.calibration.system_matrix import (
+    matrix_blocks,
+    read_matrix,
     stored_blocks,
     write_matrix,
 )

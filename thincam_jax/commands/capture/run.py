@@ -19,7 +19,7 @@ from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.measured import write_image
-from thincam_jax.measured.calibration import Alignment
+from thincam_jax.measured.calibration.alignment import Alignment
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
 from thincam_jax.studies.evaluate import as_picture

@@ -14,25 +14,19 @@ from thincam_jax.commands.sections import (
     build_solver,
 )
 from thincam_jax.commands.study import build
-from thincam_jax.design import (
+from thincam_jax.design import BayesError, PhotonNoise, PowerLaw, Setup, SignalNoise, design_problem
+from thincam_jax.design.design import Design
+from thincam_jax.design.objectives import (
+    OBJECTIVES,
     AbstractObjective,
-    BayesError,
-    Design,
-    DesignProblem,
-    PhotonNoise,
-    PowerLaw,
     ResolutionLimit,
     RobustError,
-    Setup,
-    SignalNoise,
-    TrainingError,
-    TrainingSettings,
     Unevenness,
     WorstRatio,
-    design_problem,
-    fit_power_law,
 )
-from thincam_jax.design.objectives import OBJECTIVES
+from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.setup import fit_power_law
+from thincam_jax.design.training_search import TrainingError, TrainingSettings
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.learn import Denoiser
 from thincam_jax.studies.design import DesignStudy, FrontPlan, TrainingPlan, as_method

@@ -24,23 +24,21 @@ from thincam_jax.commands.sections import (
     check_names,
 )
 from thincam_jax.design import (
-    Design,
     DesignSpace,
     FrequencyCounts,
-    Limits,
     PhotonNoise,
     SearchSettings,
     SignalNoise,
-    Tolerances,
-    TrainingError,
-    TrainingSettings,
     Variable,
-    found_name,
     shots,
 )
-from thincam_jax.design.space import QUANTITIES
+from thincam_jax.design.design import Design
+from thincam_jax.design.objectives import Tolerances
+from thincam_jax.design.ranking import found_name
+from thincam_jax.design.space import QUANTITIES, Limits
+from thincam_jax.design.training_search import TrainingError, TrainingSettings
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.imaging.targets import sample_images
+from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.units import parse_quantity
 
 ObjectiveName = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]

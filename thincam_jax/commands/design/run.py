@@ -11,7 +11,7 @@ from thincam_jax.commands.design import report
 from thincam_jax.commands.design.build import as_study_config
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, Step, as_record
-from thincam_jax.design import NonFiniteObjectiveError
+from thincam_jax.design.search import NonFiniteObjectiveError
 from thincam_jax.plot import design as plot
 from thincam_jax.plot.frame import as_png
 from thincam_jax.plot.studies import draw_found

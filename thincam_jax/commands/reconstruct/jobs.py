@@ -14,12 +14,14 @@ from thincam_jax import measured
 from thincam_jax._core.files import write_whole, writing
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.options import Background, Output, Sources
-from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
+from thincam_jax.measured import MeasurementError, write_image
 from thincam_jax.measured.dark import without_hot_pixels
 from thincam_jax.measured.examination import Examination, Finding, examine
 from thincam_jax.measured.merging import merge_images
 from thincam_jax.measured.preparation import Background as Level
-from thincam_jax.measured.read import image_files, pair_backgrounds
+from thincam_jax.measured.preparation import Prepared
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import image_files, pair_backgrounds, read_images
 from thincam_jax.measured.write import LINEAR
 
 
@@ -74,7 +76,7 @@ class Rig:
             self.psfs = [given]
         elif sources.distances:
             assert isinstance(given, Path)
-            self.psfs = measured.read_images(given, psf_bits)
+            self.psfs = read_images(given, psf_bits)
             if len(self.psfs) != len(sources.distances):
                 raise MeasurementError(
                     f"{given}: holds {len(self.psfs)} PSFs for {len(sources.distances)} distances; "
@@ -92,11 +94,11 @@ class Rig:
         psf = self.psfs[job.focus or 0]
         return examine([image], psf, self.sources.preparation), background
 
-    def prepare(self, capture: Path) -> measured.Prepared:
+    def prepare(self, capture: Path) -> Prepared:
         paired = tuple(pair_backgrounds([capture], self.sources.background))
         return self.ready(*self.examine(Job(capture, (), backgrounds=paired)))
 
-    def ready(self, examined: Examination, background: Level | None) -> measured.Prepared:
+    def ready(self, examined: Examination, background: Level | None) -> Prepared:
         psf, (image,) = examined.psf, examined.captures
         assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}

@@ -13,16 +13,11 @@ from thincam_jax.commands.study.build import assemble, check_optics
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import WhiteBalance
-from thincam_jax.reconstruction import (
-    SOLVERS,
-    AbstractSolver,
-    AdmmTV,
-    Cameras,
-    Fista,
-    Ridge,
-    TotalVariation,
-)
+from thincam_jax.reconstruction import AbstractSolver, TotalVariation
 from thincam_jax.reconstruction.depth.refocus import increasing
+from thincam_jax.reconstruction.imaging_model import Cameras
+from thincam_jax.reconstruction.methods import SOLVERS, AdmmTV, Fista
+from thincam_jax.reconstruction.ridge import Ridge
 from thincam_jax.studies.prepared import computed_psf
 from thincam_jax.units import parse_quantity
 

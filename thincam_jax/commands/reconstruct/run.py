@@ -20,12 +20,15 @@ from thincam_jax.commands.reconstruct.jobs import Job, Rig, write_job
 from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
 from thincam_jax.measured.examination import Finding, finding
+from thincam_jax.measured.preparation import Prepared
 from thincam_jax.measured.write import LINEAR, linear_bytes
-from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver, refine
-from thincam_jax.reconstruction.depth import depth_of_colours
+from thincam_jax.reconstruction import TotalVariation
+from thincam_jax.reconstruction.depth.find import depth_of_colours
+from thincam_jax.reconstruction.iterate import Progress
+from thincam_jax.reconstruction.methods import choose_solver
 from thincam_jax.reconstruction.other_psf import RESIZE, TURN
-from thincam_jax.reconstruction.psf_check import blocks_blur
-from thincam_jax.reconstruction.refinement import changed_psf
+from thincam_jax.reconstruction.psf_check import blocks_blur, check_psf
+from thincam_jax.reconstruction.refinement import changed_psf, refine
 from thincam_jax.studies.prepared import (
     PixelNoise,
     PreparedResult,
@@ -189,7 +192,7 @@ def _source_facts(sources: Sources) -> dict[str, Any]:
 
 
 def _reconstruct(
-    job: Job, ready: measured.Prepared, recipe: Recipe, noise: PixelNoise, report: Report | None
+    job: Job, ready: Prepared, recipe: Recipe, noise: PixelNoise, report: Report | None
 ) -> Finished:
     """The image, unturned; its record is of the method alone."""
     solver = recipe.solver(len(ready.capture))
@@ -228,7 +231,7 @@ def _reconstruct(
     return Finished(job, facts, image, line, doubt, *ending)
 
 
-def _left(ready: measured.Prepared, done: PreparedResult) -> tuple[float, float]:
+def _left(ready: Prepared, done: PreparedResult) -> tuple[float, float]:
     """Residual of a capture in parts of its variation, and the least that is not noise."""
     light = ready.capture[ready.valid].astype(float)
     varies = max(float(light.std()), 1e-30)
@@ -236,7 +239,7 @@ def _left(ready: measured.Prepared, done: PreparedResult) -> tuple[float, float]
     return left, 3 * done.pixel_deviation / varies
 
 
-def _doubts(job: Job, ready: measured.Prepared, done: PreparedResult) -> Iterator[Finding]:
+def _doubts(job: Job, ready: Prepared, done: PreparedResult) -> Iterator[Finding]:
     """A residual far above the noise, and a given noise that is not the one found."""
     where, (left, least) = f"capture {job.capture}", _left(ready, done)
     if why := done.found.reason:
@@ -264,7 +267,7 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
     }
 
 
-def _focus(job: Job, ready: measured.Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
+def _focus(job: Job, ready: Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
     """The image of a network; its record is of the method alone."""
     from thincam_jax.learn.refocusing.use import SURE, doubt, read
     from thincam_jax.plot.frame import as_png
@@ -304,7 +307,7 @@ def _focus(job: Job, ready: measured.Prepared, focusing: Focusing, noise: PixelN
     return Finished(job, facts, image, line, words, status, marked=marked)
 
 
-def _check_channels(job: Job, ready: measured.Prepared, recipe: Recipe, output: Output) -> None:
+def _check_channels(job: Job, ready: Prepared, recipe: Recipe, output: Output) -> None:
     """Refuse what would otherwise fail after the reconstruction."""
     channels = ready.capture.shape[0]
     if recipe.coupling == "opponent" and channels != 3:

@@ -21,7 +21,9 @@ from thincam_jax.commands.sections import (
     check_names,
 )
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
-from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
+from thincam_jax.reconstruction import AbstractSolver, TotalVariation
+from thincam_jax.reconstruction.methods import AdmmTV
+from thincam_jax.reconstruction.ridge import Ridge
 from thincam_jax.studies.pictures import PublishedImage
 from thincam_jax.studies.refocus import SceneObject
 from thincam_jax.studies.screen import ScreenModel

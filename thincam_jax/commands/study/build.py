@@ -20,8 +20,10 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless import masks
+from thincam_jax.imaging.targets.images import load_image, placed
+from thincam_jax.imaging.targets.patterns import point_grid
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.studies.evaluate import check_cameras, check_target
 from thincam_jax.studies.study import Study, Target
 
@@ -89,7 +91,7 @@ def assemble(config: CamerasConfig) -> Study:
 
 def build_optics(
     mask: MaskConfig, sensor: SensorConfig, exposure: Exposure
-) -> tuple[masks.AbstractMask, Sensor]:
+) -> tuple[AbstractMask, Sensor]:
     """The mask of an exposure, and the sensor. **Errors**: ConfigError where one is none."""
     try:
         return built_mask(mask, exposure), sensor.build()
@@ -104,10 +106,10 @@ def read_picture(target: TargetConfig) -> np.ndarray:
     if target.kind == "photograph":
         return drawn.sample_image(target.image or "", linear=linear)
     if target.kind == "file":
-        return drawn.load_image(target.path or "", linear=linear)
+        return load_image(target.path or "", linear=linear)
     shape = (target.pixels, target.pixels)
     if target.kind == "point_grid":
-        return drawn.point_grid(shape, count=(9, 9))
+        return point_grid(shape, count=(9, 9))
     return getattr(drawn, target.kind)(shape)
 
 
@@ -135,7 +137,7 @@ def picture(
         picture = np.broadcast_to(picture, (*picture.shape[:2], channels))
     if target.binary:
         picture = (picture > picture.mean()).astype(float)
-    picture = drawn.placed(picture, target.width, (target.y, target.x), target.rotation)
+    picture = placed(picture, target.width, (target.y, target.x), target.rotation)
     if picture.min() == picture.max():
         raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
     return picture

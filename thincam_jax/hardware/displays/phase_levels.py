@@ -13,7 +13,8 @@ from thincam_jax._core.files import read_json, write_whole
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import FieldError, check_fields, quantity
 from thincam_jax.hardware.displays.grey_levels import LEVELS
-from thincam_jax.lensless.masks import AbstractMask, SampledMask
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.sampled import SampledMask
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class PhaseLevels:
 
     ```python
     import numpy as np
-    from thincam_jax.hardware import PhaseLevels
+    from thincam_jax.hardware.displays.phase_levels import PhaseLevels
     from thincam_jax.units import nm
 
     table = PhaseLevels(tuple(np.linspace(0, 6.2, 17)), 532 * nm)

@@ -1,5 +1,6 @@
 """Virtual devices: the optics of this package behind the real protocols, with faults."""
 
-from thincam_jax.hardware.virtual.optics import ModulatorOptics as ModulatorOptics
-from thincam_jax.hardware.virtual.rig import Electronics as Electronics
+from thincam_jax._core.names import modules_of
 from thincam_jax.hardware.virtual.rig import VirtualRig as VirtualRig
+
+__getattr__ = modules_of(__name__)

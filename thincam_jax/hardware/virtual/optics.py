@@ -18,8 +18,9 @@ from thincam_jax._core.grids import Grid, block_mean, centred_indices
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax.hardware.displays.phase_levels import PhaseLevels
-from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse, kernel_grid
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse
 from thincam_jax.imaging.operators.base import dtype_of
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera

@@ -4,16 +4,11 @@ All are drawn eagerly, with the centre of the picture at the centre of the array
 +y down. A scene turns them into a plane at a distance with a size in mm.
 """
 
-from thincam_jax.imaging.targets.images import load_image as load_image
+from thincam_jax._core.names import modules_of
 from thincam_jax.imaging.targets.images import middle_square as middle_square
-from thincam_jax.imaging.targets.images import placed as placed
 from thincam_jax.imaging.targets.images import resize as resize
 from thincam_jax.imaging.targets.images import sample_image as sample_image
-from thincam_jax.imaging.targets.images import sample_images as sample_images
-from thincam_jax.imaging.targets.patterns import point_grid as point_grid
 from thincam_jax.imaging.targets.patterns import siemens_star as siemens_star
-from thincam_jax.imaging.targets.patterns import slanted_edge as slanted_edge
-from thincam_jax.imaging.targets.usaf import UsafElement as UsafElement
-from thincam_jax.imaging.targets.usaf import line_pair as line_pair
 from thincam_jax.imaging.targets.usaf import usaf1951 as usaf1951
-from thincam_jax.imaging.targets.usaf import usaf1951_elements as usaf1951_elements
+
+__getattr__ = modules_of(__name__)

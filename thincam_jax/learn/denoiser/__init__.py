@@ -1,4 +1,5 @@
 """A denoiser of grey images that knows no camera: its network, its training and its file."""
 
-from thincam_jax.learn.denoiser.network import network_card as network_card
-from thincam_jax.learn.denoiser.pictures import drawn as drawn
+from thincam_jax._core.names import modules_of
+
+__getattr__ = modules_of(__name__)

@@ -14,7 +14,8 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.quantity import FieldError, quantity, whole
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.method import MODELS, Model, PsfMethod

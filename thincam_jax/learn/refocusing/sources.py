@@ -10,7 +10,8 @@ from jaxtyping import Float32
 
 from thincam_jax._core.files import file_digest, read_regular
 from thincam_jax.imaging.encoding import decode_srgb
-from thincam_jax.imaging.targets import load_image, middle_square, resize, sample_image
+from thincam_jax.imaging.targets import middle_square, resize, sample_image
+from thincam_jax.imaging.targets.images import load_image
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")

@@ -83,13 +83,13 @@ class AxisFactors(Module):
 
     ```python
     import jax.numpy as jnp
-    import thincam_jax as tc
+    from thincam_jax.lensless.masks import AxisFactors, MaskTerms
 
-    slit = tc.AxisFactors(jnp.array([-0.1, 0.1]), jnp.array([[1.0 + 0.0j]]))  # one open cell
-    terms = tc.MaskTerms(jnp.array([1.0 + 0.0j]), slit, slit)
+    slit = AxisFactors(jnp.array([-0.1, 0.1]), jnp.array([[1.0 + 0.0j]]))  # one open cell
+    terms = MaskTerms(jnp.array([1.0 + 0.0j]), slit, slit)
     ```
 
-    **See also**: `MaskTerms`.
+    **See also**: `lensless.masks.MaskTerms`.
     """
 
     edges: Float[Array, " edge"]
@@ -154,7 +154,7 @@ class MaskTerms(Module):
     print(len(terms.coefficients))  # 1
     ```
 
-    **See also**: `AxisFactors`, `AbstractFactoredMask`.
+    **See also**: `lensless.masks.AxisFactors`, `AbstractFactoredMask`.
     """
 
     coefficients: Complex[Array, " term"]
@@ -174,7 +174,7 @@ class AbstractFactoredMask(AbstractMask):
     print(mask.terms().coefficients.shape)  # (1,)
     ```
 
-    **See also**: `MaskTerms`, `AbstractMask`.
+    **See also**: `lensless.masks.MaskTerms`, `lensless.masks.base.AbstractMask`.
     """
 
     exact_model = "separable"

@@ -91,11 +91,11 @@ class SeparableMask(AbstractCellMask):
     import thincam_jax as tc
     from thincam_jax.units import um
 
-    code = tc.maximum_length_sequence(31)
+    code = tc.lensless.masks.maximum_length_sequence(31)
     mask = tc.SeparableMask(code, code, cell=30 * um, combine="xor")
     ```
 
-    **See also**: `maximum_length_sequence`, `separable_operator`.
+    **See also**: `lensless.masks.maximum_length_sequence`, `separable_operator`.
     """
 
     rows: Float[Array, " row"] = eqx.field(converter=quantity(check=checks.transmittances))
@@ -126,7 +126,7 @@ def maximum_length_sequence(length: int) -> Float[np.ndarray, " length"]:
     ```python
     import thincam_jax as tc
 
-    print(tc.maximum_length_sequence(7))  # [1. 1. 1. 0. 1. 0. 0.]
+    print(tc.lensless.masks.maximum_length_sequence(7))  # [1. 1. 1. 0. 1. 0. 0.]
     ```
 
     **See also**: `SeparableMask`.

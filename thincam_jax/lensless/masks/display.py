@@ -73,9 +73,10 @@ def on_display(mask: AbstractMask, pixel_pitch: Number, fill_factor: Number = 1.
 
     ```python
     import thincam_jax as tc
+    from thincam_jax.lensless.masks.display import on_display
     from thincam_jax.units import um
 
-    mask = tc.on_display(tc.FresnelZoneAperture(25.0, width=1.44), 36 * um, fill_factor=0.9)
+    mask = on_display(tc.FresnelZoneAperture(25.0, width=1.44), 36 * um, fill_factor=0.9)
     ```
 
     **See also**: `FresnelZoneAperture`.

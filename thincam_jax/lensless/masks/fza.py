@@ -81,7 +81,7 @@ class FresnelZoneAperture(AbstractFactoredMask):
     h = tc.psf(camera, wavelength=500 * nm, object_distance=250.0)
     ```
 
-    **See also**: `LenslessCamera`, `psf`, `on_display`.
+    **See also**: `LenslessCamera`, `psf`, `lensless.masks.display.on_display`.
     """
 
     beta: Float[Array, ""] = eqx.field(converter=quantity("rad/mm^2", positive=True))

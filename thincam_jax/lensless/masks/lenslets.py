@@ -36,7 +36,7 @@ class LensletArray(AbstractFactoredMask):
     h = tc.psf(camera, wavelength=500 * nm)
     ```
 
-    **See also**: `voronoi_fresnel`.
+    **See also**: `lensless.masks.reliefs.voronoi_fresnel`.
     """
 
     focal_length: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))

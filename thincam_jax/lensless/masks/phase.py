@@ -86,7 +86,7 @@ class PhaseMask(AbstractMask):
     mask = tc.PhaseMask(steps, pitch=10 * um, material=1.5)
     ```
 
-    **See also**: `MaskBlank`, `diffuser`, `voronoi_fresnel`.
+    **See also**: `lensless.masks.MaskBlank`, `lensless.masks.reliefs.diffuser`.
     """
 
     height: Float[Array, "y x"] = eqx.field(converter=quantity("mm", check=_HEIGHT))
@@ -179,11 +179,11 @@ class MaskBlank(Module):
     import thincam_jax as tc
     from thincam_jax.units import um
 
-    blank = tc.MaskBlank((24, 32), pitch=10 * um, material=1.5)
-    mask = tc.diffuser(0, blank, correlation_length=50 * um, rms_slope=0.03)
+    blank = tc.lensless.masks.MaskBlank((24, 32), pitch=10 * um, material=1.5)
+    mask = tc.lensless.masks.reliefs.diffuser(0, blank, correlation_length=50 * um, rms_slope=0.03)
     ```
 
-    **See also**: `PhaseMask`, `diffuser`.
+    **See also**: `PhaseMask`, `lensless.masks.reliefs.diffuser`.
     """
 
     shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)

@@ -117,7 +117,7 @@ class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
     h = tc.psf(camera, wavelength=500 * nm)
     ```
 
-    **See also**: `UniformlyRedundantArray`.
+    **See also**: `lensless.masks.UniformlyRedundantArray`.
     """
 
     order: int = eqx.field(converter=quantity(check=_prime_order), static=True)
@@ -150,7 +150,7 @@ class UniformlyRedundantArray(AbstractRedundantArray):
     import thincam_jax as tc
     from thincam_jax.units import um
 
-    mask = tc.UniformlyRedundantArray((13, 11), cell=60 * um)
+    mask = tc.lensless.masks.UniformlyRedundantArray((13, 11), cell=60 * um)
     ```
 
     **See also**: `ModifiedUniformlyRedundantArray`.

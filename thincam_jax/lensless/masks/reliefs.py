@@ -34,15 +34,16 @@ def diffuser(
     - `rms_slope`: s along an axis, dimensionless. The lowest height is 0.
 
     ```python
-    import thincam_jax as tc
+    from thincam_jax.lensless.masks import MaskBlank
+    from thincam_jax.lensless.masks.reliefs import diffuser
     from thincam_jax.units import um
 
-    blank = tc.MaskBlank((24, 32), pitch=10 * um, material=1.5)
-    mask = tc.diffuser(0, blank, correlation_length=50 * um, rms_slope=0.03)
+    blank = MaskBlank((24, 32), pitch=10 * um, material=1.5)
+    mask = diffuser(0, blank, correlation_length=50 * um, rms_slope=0.03)
     print(mask.height.shape)  # (24, 32)
     ```
 
-    **See also**: `PhaseMask`, `voronoi_fresnel`.
+    **See also**: `PhaseMask`, `lensless.masks.reliefs.voronoi_fresnel`.
     """
     length = checks.positive("correlation_length", correlation_length, "mm")
     slope = checks.positive("rms_slope", rms_slope, "a ratio")
@@ -92,11 +93,12 @@ def voronoi_fresnel(
     1/(2 pitch): lenses that reach farther are refused.
 
     ```python
-    import thincam_jax as tc
+    from thincam_jax.lensless.masks import MaskBlank
+    from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
     from thincam_jax.units import nm, um
 
-    blank = tc.MaskBlank((24, 32), pitch=10 * um, material=1.5)
-    mask = tc.voronoi_fresnel(0, blank, sites=3, focal_length=6.0, wavelength=550 * nm)
+    blank = MaskBlank((24, 32), pitch=10 * um, material=1.5)
+    mask = voronoi_fresnel(0, blank, sites=3, focal_length=6.0, wavelength=550 * nm)
     ```
 
     **See also**: `PhaseMask`, `LensletArray`.

@@ -63,7 +63,7 @@ class SampledMask(AbstractFactoredMask):
     h = tc.psf(camera, wavelength=500 * nm)
     ```
 
-    **See also**: `random_cells`, `read_mask`.
+    **See also**: `lensless.masks.random_cells`, `read_mask`.
     """
 
     amplitude: Transmittance = eqx.field(converter=_amplitudes)
@@ -162,7 +162,7 @@ def random_cells(
     import thincam_jax as tc
     from thincam_jax.units import um
 
-    mask = tc.random_cells(0, width=0.6, cell=30 * um)
+    mask = tc.lensless.masks.random_cells(0, width=0.6, cell=30 * um)
     print(mask.amplitude.shape)  # (20, 20)
     ```
 

@@ -8,7 +8,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import fast_shape
 from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
-from thincam_jax.imaging.operators import kernel_shape
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import tolerance_of
 from thincam_jax.lensless.camera import LenslessCamera

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from thincam_jax._core.precision import itemsize_of
-from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost

@@ -21,21 +21,15 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax._core.quantity import quantities, unchecked
-from thincam_jax.imaging.operators import Matrix, Scaled
+from thincam_jax.imaging.operators import Matrix
+from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.imaging.refractive_index import changed
 from thincam_jax.measured.calibration.problem import Status, covariance, hardly_seen, verdict
 from thincam_jax.measured.raw import MeasurementError
-from thincam_jax.waveguide import (
-    ObjectPlane,
-    Screen,
-    SeeThroughCamera,
-    VolumeHologram,
-    pixel_centres,
-    system_operator,
-    trace,
-    trace_band,
-)
-from thincam_jax.waveguide.system import seen_size
+from thincam_jax.waveguide import ObjectPlane, Screen, SeeThroughCamera, VolumeHologram
+from thincam_jax.waveguide.rays import pixel_centres, trace
+from thincam_jax.waveguide.smear import trace_band
+from thincam_jax.waveguide.system import seen_size, system_operator
 
 # Parameters that can be fitted, with a step of small effect on an image.
 PARAMETERS = {

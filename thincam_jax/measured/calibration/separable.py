@@ -76,7 +76,7 @@ def calibrate_separable(
     P, Q = np.random.default_rng(0).normal(size=(2, 6, 4))
     rows = np.stack([np.outer(p, Q.sum(axis=1)) for p in P.T])  # captures of lit rows
     columns = np.stack([np.outer(P.sum(axis=1), q) for q in Q.T])
-    fit = tc.calibrate_separable(rows, columns)
+    fit = tc.measured.calibration.calibrate_separable(rows, columns)
     ```
 
     **See also**: `fit_separable`, `separable_operator`.
@@ -159,7 +159,7 @@ def fit_separable(
     fit = tc.fit_separable(images, truth(images), Separable(1.1 * truth.left, truth.right))
     ```
 
-    **See also**: `calibrate_separable`.
+    **See also**: `measured.calibration.calibrate_separable`.
     """
     images, captures = jnp.asarray(images), jnp.asarray(captures)
     expected = (len(images), *start.in_shape), (len(images), *start.out_shape)

@@ -5,17 +5,9 @@ A mask's shadow grows with M = 1 + d/t: a capture encodes the distance t of its 
 `axial_resolution` is the least difference of distances that can be resolved.
 """
 
-from thincam_jax.reconstruction.depth.find import DepthMap as DepthMap
-from thincam_jax.reconstruction.depth.find import FocusCurves as FocusCurves
-from thincam_jax.reconstruction.depth.find import FocusPeak as FocusPeak
 from thincam_jax.reconstruction.depth.find import all_in_focus as all_in_focus
 from thincam_jax.reconstruction.depth.find import depth_map as depth_map
-from thincam_jax.reconstruction.depth.find import depth_of_colours as depth_of_colours
 from thincam_jax.reconstruction.depth.find import find_distances as find_distances
-from thincam_jax.reconstruction.depth.find import object_regions as object_regions
-from thincam_jax.reconstruction.depth.focus import MEASURES as MEASURES
-from thincam_jax.reconstruction.depth.focus import focus_measure as focus_measure
-from thincam_jax.reconstruction.depth.refocus import RefocusSweep as RefocusSweep
 from thincam_jax.reconstruction.depth.refocus import axial_resolution as axial_resolution
 from thincam_jax.reconstruction.depth.refocus import refocus_distances as refocus_distances
 from thincam_jax.reconstruction.depth.refocus import refocus_sweep as refocus_sweep

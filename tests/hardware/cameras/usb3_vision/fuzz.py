@@ -17,8 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thincam_jax.hardware import CameraSettings, HardwareError, Region
-from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera, gencp, link, stream
+from thincam_jax.hardware import CameraSettings, HardwareError
+from thincam_jax.hardware.base import Region
+from thincam_jax.hardware.cameras.usb3_vision import gencp, link, stream
+from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
 from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 
 LEADER = stream.LEADER.pack(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hardware.cameras.usb3_vision.usbfs import PRELOAD, presented
 
-from thincam_jax.hardware import Region
+from thincam_jax.hardware.base import Region
 
 pytestmark = pytest.mark.skipif(not PRELOAD.exists(), reason="needs Debian's umockdev")
 

@@ -1,0 +1,30 @@
+"""Attributes of packages: their modules, and the nearest name where one is misspelt."""
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from typing import Any
+
+
+def modules_of(package: str, names: Callable[[str], Any] | None = None) -> Any:
+    """`__getattr__` of a package, by which `tc.imaging.operators` needs no import of its own.
+
+    `names` gets the names of a lazy package. A module is imported at its first use. Any other name
+    is an `AttributeError` that tells the nearest one. A type checker sees `Any` and goes on to
+    report unknown names.
+    """
+
+    def attribute(name: str) -> Any:
+        known, path = dir(sys.modules[package]), f"{package}.{name}"
+        if names is not None and name in known:
+            return names(name)
+        if not name.startswith("_") and importlib.util.find_spec(path):
+            return importlib.import_module(path)
+        import difflib
+
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f": did you mean {near[0]}?" if near else ""
+        raise AttributeError(f"{package} has no name {name}{hint}", name=name)
+
+    return attribute
