@@ -144,19 +144,22 @@ def published_figures(targets: Sequence[ScreenTargetConfig]) -> dict[str, dict[s
 
 
 def page(
-    result: ScreenResult, rays: RaySummary, calibration: CalibrationScores | None, peak: float
+    result: ScreenResult,
+    rays: RaySummary,
+    calibration: CalibrationScores | None,
+    peak: float | None,
 ) -> Page:
-    """The page of a finished run; `peak`: the most memory it took, GB."""
+    """The page of a finished run; `peak`: the most memory it took, GB, where that is known."""
     config: ScreenConfig = result.study.config
     last = config.methods[-1].name
     published = published_figures(config.targets)
     mask, captions = config.mask, plot.captions(result.study)
     behind = "" if mask is None else f"{mask.label}, {mask.distance:g} mm before it, "
+    memory = "" if peak is None else f" {peak:.1f} GB of memory at most."
     lead = (
         f"{pixels_of(config.sensor)}, {behind}behind a glass of {config.screen.glass_thickness:g} "
         f"mm; {config.object.cells[0]}×{config.object.cells[1]} cells at "
-        f"{config.object.distance:g} mm, {config.orders} ghost orders, seed {config.seed}. "
-        f"{peak:.1f} GB of memory at most.",
+        f"{config.object.distance:g} mm, {config.orders} ghost orders, seed {config.seed}.{memory}",
         Picture("images.png", "Targets, captures, reconstructions", captions["images"]),
         Picture("rays.png", "Rays in side view", captions["rays"]),
         Picture(
