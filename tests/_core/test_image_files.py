@@ -25,7 +25,7 @@ from thincam_jax.measured.sensor import SensorCalibration
 SHAPE = (21, 34)
 GREY = np.random.default_rng(0).integers(1, 255, SHAPE).astype(np.uint8)
 COLOUR = np.random.default_rng(1).integers(1, 255, (*SHAPE, 3)).astype(np.uint8)
-pytestmark = pytest.mark.filterwarnings("ignore::thincam_jax.measured.NonlinearWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::thincam_jax.measured.read.NonlinearWarning")
 
 
 def saved(pixels, kind, **options):

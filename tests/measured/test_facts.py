@@ -164,7 +164,7 @@ def test_masked_arrays_and_infinite_values():
 
 
 @pytest.mark.parametrize("suffix", ["tif", "exif.tif", "png", "jpg", "dng", "broken.tif"])
-@pytest.mark.filterwarnings("ignore::thincam_jax.measured.NonlinearWarning")
+@pytest.mark.filterwarnings("ignore::thincam_jax.measured.read.NonlinearWarning")
 def test_exposure(tmp_path, suffix):
     """By TIFF's own tag and by EXIF; a number that is none is not taken."""
     path, pixels = tmp_path / f"a.{suffix}", np.full(SHAPE, 1000, np.uint16)

@@ -12,7 +12,7 @@ by conjugate gradients, preconditioned by the mean of AᵀA/σ² over rings of f
 noise shows. Their derivative is taken implicitly, at the solution, by another solve.
 
 With a denoiser D that estimate is the start of plug and play, much as that of
-`thincam_jax.learn.PlugAndPlay`: with a deviation s of the prior that falls in four steps,
+`thincam_jax.PlugAndPlay`: with a deviation s of the prior that falls in four steps,
 
 .. math:: \hat f \leftarrow D(z, s/2), \qquad
     \Big(\sum_c \frac{A_c^T A_c}{\sigma_c^2} + \frac1{s^2}\Big) z

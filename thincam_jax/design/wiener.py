@@ -1,8 +1,8 @@
 r"""The error of the Wiener synthesis of training images, differentiated through it.
 
-`thincam_jax.reconstruction.WienerSynthesis` as a smooth function of every number of a design, the
-distances too: captures are not enlarged to one scale; their spectra are taken where the scene's
-angular frequencies ν fall on each sensor, at ν/d,
+`thincam_jax.reconstruction.wiener.WienerSynthesis` as a smooth function of every number of a
+design, the distances too: captures are not enlarged to one scale; their spectra are taken where the
+scene's angular frequencies ν fall on each sensor, at ν/d,
 
 .. math:: G_c(\nu) = p^2 \sum_x g_c(x)\, e^{-2\pi j\nu x/d}, \qquad
     \hat F = \frac{\sum_c H_c\, d_c^2\, G_c/\eta_c}{\sum_c H_c^2\, d_c^4/\eta_c + 1/\eta_f}

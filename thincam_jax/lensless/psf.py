@@ -79,7 +79,7 @@ def psf(
     - `object_distance`: t, mm; infinity is a plane wave.
     - `at`: (y, x) of the point, mm, by default on the axis; of a plane wave the tangents of its
       angles. The shadow then moves by −d/t of it, and the waves are those about the ray through the
-      mask's middle (`thincam_jax.lensless.propagation.Path`). Of cells off both axes, and of rings,
+      mask's middle (`thincam_jax.lensless.Path`). Of cells off both axes, and of rings,
       "separable" then samples: for a MURA of 23 × 23 cells of 62 µm (d = 6.5 mm, averages over
       pixels of 22 µm) 0.8 % off at 20° and 30°, at azimuths of 30° and 45°; 6 % at the centres of
       pixels. A traced point counts as off both axes, unless one coordinate is a plain 0.
