@@ -81,7 +81,7 @@ CASES = {
         lambda: CAMERAS.focused(200.0),
     ),
     "reconstruction inside jit": Case(
-        "use tc.solve_fixed_point there",
+        "use tc.reconstruction.solve_fixed_point there",
         lambda: jax.jit(lambda g: tc.reconstruct(replace(PSFS, captures=(g[None],)), FEW).image)(
             jnp.asarray(CAPTURE)
         ),

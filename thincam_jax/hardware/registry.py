@@ -19,7 +19,7 @@ from thincam_jax.hardware.errors import NotFound
 
 _BUILT_IN = {
     "cameras": {
-        "usb3_vision": "thincam_jax.hardware.cameras.usb3_vision:Usb3VisionCamera",
+        "usb3_vision": "thincam_jax.hardware.cameras.usb3_vision.camera:Usb3VisionCamera",
         "pylon": "thincam_jax.hardware.cameras.pylon:PylonCamera",
         "aravis": "thincam_jax.hardware.cameras.aravis:AravisCamera",
         "pylablib": "thincam_jax.hardware.cameras.pylablib:PylablibCamera",

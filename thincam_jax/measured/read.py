@@ -233,7 +233,7 @@ def _true_name(path: Path) -> str:
         start = file.read(12)
     array = f"numpy.save({str(path.with_suffix('.npy'))!r}"
     if path.suffix.lower() in (".raw", ".raw10", ".raw12", ".bin"):
-        given = f"measured.unpack_raw({str(path)!r}, (rows, columns), bits=10)"
+        given = f"measured.containers.unpack_raw({str(path)!r}, (rows, columns), bits=10)"
         return f"is packed counts without their size; {array}, {given})"
     for first, (name, call) in _OTHERS.items():
         if first in (start[: len(first)], start[4 : 4 + len(first)], start[8 : 8 + len(first)]):

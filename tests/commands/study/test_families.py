@@ -11,7 +11,6 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.lensless import masks as mask_room
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence
 from thincam_jax.lensless.masks.display import on_display
 from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
@@ -91,7 +90,9 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     picture = Image.fromarray(np.uint8(255 * np.eye(12)))
     picture.save(tmp_path / "picture.png")
     read, read_mask = [], tc.read_mask
-    monkeypatch.setattr(mask_room, "read_mask", lambda *a: read.append(a) or read_mask(*a))
+    monkeypatch.setattr(
+        "thincam_jax.commands.mask.read_mask", lambda *a: read.append(a) or read_mask(*a)
+    )
     shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
     mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"
     built = build_study(load_experiment(written(tmp_path, mask, shots)))
