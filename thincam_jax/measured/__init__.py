@@ -1,6 +1,7 @@
 """Measured captures: reading files, preparation for a reconstruction, writing images."""
 
 from thincam_jax._core.names import modules_of
+from thincam_jax.measured.examination import examine as examine
 from thincam_jax.measured.options import Preparation as Preparation
 from thincam_jax.measured.preparation import prepare as prepare
 from thincam_jax.measured.raw import MeasurementError as MeasurementError
