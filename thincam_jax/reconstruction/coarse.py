@@ -42,6 +42,16 @@ def coarser(
     return _coarser(problem, operators, image)
 
 
+def coarsened(
+    problem: InverseProblem, image: Image, times: int
+) -> tuple[InverseProblem, Float[Array, "..."], int]:
+    """The problem on pixels halved in number up to so many times, its start, and their size."""
+    size = 1
+    while size < _SIZE**times and (smaller := coarser(problem, image)) is not None:
+        (problem, image), size = smaller, _SIZE * size
+    return problem, image, size
+
+
 def finer(image: Image, shape: tuple[int, int]) -> Float[Array, "..."]:
     """An image of `coarser` on the pixels of the field, interpolated linearly."""
     whole = (*image.shape[:-2], *(_SIZE * n for n in image.shape[-2:]))

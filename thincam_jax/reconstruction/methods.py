@@ -331,16 +331,19 @@ class AdmmTV(AbstractRegularised):
 
     def _lowest(self, problem: InverseProblem, image: Image) -> float:
         """The lowest objective, roughly."""
-        rough = dataclasses.replace(self, tolerance=max(self.tolerance, _ROUGH))
-        return float(rough._from_nothing(problem, image, None).history[-1].objective)
+        return float(self._rough._from_nothing(problem, image, None).history[-1].objective)
+
+    @property
+    def _rough(self) -> "AdmmTV":
+        """This solver with the tolerance of a start."""
+        return dataclasses.replace(self, tolerance=max(self.tolerance, _ROUGH))
 
     def _by_levels(self, problem, image, callback, levels: int) -> Outcome:
         """Outcome by way of pixels up to `levels` times halved, which begin by `_from_nothing`."""
         coarse = coarser(problem, image) if levels else None
         if coarse is None:
             return self._from_nothing(problem, image, callback)
-        rough = dataclasses.replace(self, tolerance=max(self.tolerance, _ROUGH))
-        first = rough._by_levels(*coarse, None, levels - 1)
+        first = self._rough._by_levels(*coarse, None, levels - 1)
         image = finer(first.image, problem.field_shape)
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)

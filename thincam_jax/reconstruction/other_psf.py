@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex
 
-from thincam_jax.reconstruction.coarse import coarser
+from thincam_jax.reconstruction.coarse import coarsened
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions
 from thincam_jax.reconstruction.psf_check import scaled_psf
 from thincam_jax.reconstruction.regularisers import Image
@@ -37,8 +37,7 @@ def better_psf(
     - `of_any_size`: whether other sizes are tried. Smooth light that nothing explains, such as a
       scene beyond the field, fits a smaller PSF better, too.
     """
-    for _ in range(_COARSER):
-        problem, image = coarser(problem, image) or (problem, image)
+    problem, image, _ = coarsened(problem, image, _COARSER)
     operators = convolutions(problem)
     if operators is None or min(problem.field_shape) > _LARGEST:
         return ""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.grids import same_parity
 from thincam_jax.imaging.operators.crop_convolution import middle_corner, place
-from thincam_jax.reconstruction.coarse import coarser
+from thincam_jax.reconstruction.coarse import coarsened
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
@@ -71,9 +71,7 @@ def outside_light(
     except MemoryError:
         return None
     start = place(image, middle_corner(field, wide.field_shape), wide.field_shape)
-    size = 1
-    while size < 2**_HALVED and (smaller := coarser(wide, start)) is not None:
-        (wide, start), size = smaller, 2 * size
+    wide, start, size = coarsened(wide, start, _HALVED)
     method = in_parallel(wide, functools.partial(admm_method, near=True))
     found = iterate(method, start, _SCHEDULE).image
     before, after = (misfit_of(wide, one) for one in (start, found))
@@ -98,7 +96,7 @@ def outside_light(
 
 
 def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recording:
-    """A recording whose field, where none is given, holds a start image larger than the sensor."""
+    """A recording whose field holds the start image; a field that is given stays."""
     model = recording.imaging_model
     if start is None or start.ndim < 2 or not isinstance(model, Cameras):
         return recording
@@ -109,7 +107,7 @@ def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recordi
 
 
 def pinned(recording: Recording) -> Recording:
-    """A recording whose field stays the sensor's where none is given, whatever is found outside."""
+    """A recording that keeps the sensor's field; a field that is given stays."""
     model = recording.imaging_model
     if not isinstance(model, Cameras) or model.pixels is not None:
         return recording

@@ -355,11 +355,11 @@ class Recording(Module):
         return [jnp.where(t > 0, t, f) for t, f in zip(totals, found, strict=True)]
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:
-        model = self.imaging_model
-        if isinstance(model, Stacked) and any(len(s) < 2 for s in shapes_of(model.out_shape)):
+        given = getattr(self.imaging_model, "operators", ())
+        if any(len(s) < 2 for one in given for s in shapes_of(one.out_shape)):
             raise ValueError("give noise_variance: it is estimated from captures that are images")
         found = estimate_variance(captures, None if valid[0] is None else valid)
-        return unseen_variance(self._operators(), captures, found) if valid[0] is None else found
+        return unseen_variance(given, captures, found) if valid[0] is None else found
 
     def _pitch(self, dtype) -> Float[Array, ""]:
         if isinstance(self.imaging_model, Cameras):

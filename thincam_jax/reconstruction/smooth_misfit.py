@@ -61,7 +61,7 @@ class Misfit:
 
     @property
     def is_smooth(self) -> bool:
-        """Whether most of what is left is smooth."""
+        """Whether the residual is mostly smooth."""
         return max(self.smooth) > max(_MISFIT, _SMOOTH * self.whole)
 
     def less_smooth(self, problem: InverseProblem) -> InverseProblem | None:

@@ -103,7 +103,7 @@ def reconstruct(
         Option(help="Of a raw pixel, standard deviation in counts. Default: estimated."),
     ] = None,
     iterations: Annotated[
-        int | None, Option(help="At most. Default: 300; of fista 100, pnp 8, ridge 1000.")
+        int | None, Option(help="At most. Default: 300; of fista 100, pnp 5, ridge 1000.")
     ] = None,
     coupling: Annotated[
         Literal["none", "joint", "opponent"] | None,
