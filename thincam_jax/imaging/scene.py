@@ -203,9 +203,10 @@ class Scene(Module):
         *,
         wavelength: Number | None = None,
     ):
-        if (spectrum is None) == (wavelength is None):
+        lights = [light for light in (spectrum, wavelength) if light is not None]
+        if len(lights) != 1:
             raise TypeError("give the light of a Scene once: a Spectrum, or wavelength= in mm")
-        spectrum = wavelength if spectrum is None else spectrum
+        (spectrum,) = lights
         planes = (planes,) if isinstance(planes, ImagePlane) else planes
         if not isinstance(planes, Iterable) or not all(isinstance(p, ImagePlane) for p in planes):
             raise TypeError(f"planes is {checks.shown(planes)}; give an ImagePlane, or several")
