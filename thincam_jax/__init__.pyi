@@ -41,6 +41,7 @@ from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import PsfMethod as PsfMethod
 from .lensless.plan.make import plan as plan
+from .lensless.psf import mtf as mtf
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
 from .lensless.separable_operator import separable_operator as separable_operator

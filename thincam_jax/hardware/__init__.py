@@ -12,7 +12,6 @@ from thincam_jax.hardware.acquisition.rig import open_rig as open_rig
 from thincam_jax.hardware.base import Camera as Camera
 from thincam_jax.hardware.base import CameraSettings as CameraSettings
 from thincam_jax.hardware.base import Display as Display
-from thincam_jax.hardware.base import Frame as Frame
 from thincam_jax.hardware.base import Stage as Stage
 from thincam_jax.hardware.errors import HardwareError as HardwareError
 
