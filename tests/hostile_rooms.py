@@ -216,7 +216,7 @@ LEARNED = (
     ),
     call(learn.load, path="nothing", cameras=camera()),
     call(
-        learn.load_suggester, path="nothing", model=call(design.ResponseModel, space=SPACE, **SEEN)
+        learn.Suggester.load, path="nothing", model=call(design.ResponseModel, space=SPACE, **SEEN)
     ),
     call(denoised, network="shipped", image=IMAGE, sigma=0.1),
     call(tc.PlugAndPlay, denoiser="shipped", strength=1.0, iterations=2, tolerance=1e-3),

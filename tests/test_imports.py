@@ -137,7 +137,8 @@ def test_the_core_runs_without_any_extra(tmp_path):
         f"import sys; sys.modules |= dict.fromkeys({extras})\n"
         + as_command(f"run {file} --out {tmp_path / 'out'}")
         + f"""
-from thincam_jax.measured import CaptureFileError, read_image
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured import read_image
 try:
     read_image({str(tiff)!r})
 except CaptureFileError as error:
