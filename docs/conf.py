@@ -138,7 +138,6 @@ MODULES = (
     "studies.mask_captures",
     "studies.mask_comparison",
     "studies.prepared",
-    "studies.psf_error_cost",
     "waveguide.colours",
     "waveguide.distance",
     "waveguide.rays",
