@@ -135,8 +135,6 @@ MODULES = (
     "reconstruction.problem",
     "reconstruction.solver",
     "studies.design",
-    "studies.mask_captures",
-    "studies.mask_comparison",
     "studies.prepared",
     "waveguide.colours",
     "waveguide.distance",
