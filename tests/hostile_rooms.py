@@ -49,8 +49,6 @@ from thincam_jax.measured.calibration.hadamard import hadamard_pattern, walsh_ha
 from thincam_jax.measured.calibration.start import PsfSearch
 from thincam_jax.measured.read import list_captures
 from thincam_jax.measured.write import log_text
-from thincam_jax.studies.mask_captures import ComparedMask, Setting
-from thincam_jax.studies.mask_comparison import ComparedScene, Tuning
 
 
 def space(base: Any, variable: Any, limits: Any) -> design.DesignSpace:
@@ -194,11 +192,6 @@ STUDIES = (
             seed=0,
         ),
         target=TARGET,
-    ),
-    call(at_once(ComparedMask, "masks"), masks=ZONES, sort="a", synthesis="separate"),
-    call(Setting, sensor=SENSOR, distance=6.5, field=(9, 12), width=1.2, read_noise=3.0),
-    call(
-        Tuning, scene=call(ComparedScene, image=IMAGE, prior="flat"), tau=(0.5, 1.0), iterations=60
     ),
 )
 LEARNED = (

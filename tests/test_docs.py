@@ -349,10 +349,9 @@ def test_picture_of_the_rooms_can_be_drawn(tmp_path):
 def test_learned_thesis_page(monkeypatch):
     """What the page says of the optics of both cameras; at small size, too, the thesis' planes are
     not told apart, and those here are."""
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
     page = (ROOT / "docs/measured/refocusing_thesis.md").read_text("utf-8")
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
-        script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
+        script = runpy.run_path(str(ROOT / "benchmarks/refocusing/thesis_refocusing.py"))
         thesis, optics = script["thesis_camera"], script["optics"]
         path = ROOT / "configs/learned_refocus.yaml"
         here = build_camera(load_experiment(path, (), "train"))

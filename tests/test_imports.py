@@ -61,7 +61,7 @@ def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
 
 
 HELP = [
-    *("--help", "--version", "run --help", "bench accuracy --help", "calibrate check --help"),
+    *("--help", "--version", "run --help", "calibrate check --help"),
     *(
         f"{command} --help"
         for command in ("reconstruct", "sweep", "design", "doctor", "init", "capture", "train")
