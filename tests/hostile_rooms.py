@@ -28,8 +28,9 @@ from thincam_jax.design.plate import Plate, Viewing, judge_plate
 from thincam_jax.design.ranking import score_design
 from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
-from thincam_jax.hardware.acquisition import plan as plans
+from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
+from thincam_jax.hardware.acquisition.plan import Plan, Step
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
@@ -231,11 +232,11 @@ RIGS = (
     call(plans.psf_stack, mask=PLATE, depths=[5.0, 6.5], settings=SETTINGS, stage_zero=1.0),
     call(plans.hadamard, series=SERIES, settings=SETTINGS),
     call(
-        at_once(plans.Plan, "patterns", "settings", "steps"),
+        at_once(Plan, "patterns", "settings", "steps"),
         name="a",
         patterns=PLATE,
         settings=SETTINGS,
-        steps=call(plans.Step, pattern=0, position=1.0, settings=0, dark=False),
+        steps=call(Step, pattern=0, position=1.0, settings=0, dark=False),
         facts={"a": 1.0},
     ),
     call(

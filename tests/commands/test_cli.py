@@ -179,6 +179,10 @@ class TestExitCode2:
             assert "Traceback" not in result.output
         assert "No such option" in call("run", file, "--ouput", "x").stderr
 
+    def test_an_option_of_one_value_given_twice(self):
+        line = call("examine", "a.tif", "--psf", "a.tif", "--psf", "b.tif").stderr
+        assert "--psf is given 2 times; give it once" in line
+
 
 def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
     """Only what a user can put right is made a line of."""

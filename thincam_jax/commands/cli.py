@@ -75,7 +75,18 @@ def with_output(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-class Grouped(TyperCommand):
+class Once(TyperCommand):
+    """Refuses an option that is given twice and takes one value: the first would be lost."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        for one in set(order):
+            if order.count(one) > 1 and not (one.multiple or one.is_flag or one.nargs != 1):
+                ctx.fail(f"{one.opts[0]} is given {order.count(one)} times; give it once")
+        return super().parse_args(ctx, args)
+
+
+class Grouped(Once):
     """Options in groups, and nothing else: for a file, the command that takes it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -126,7 +137,7 @@ for group, command, *examples in (
     (app, examine, "examine RAW.tif --psf PSF.tif", "examine CAPTURES/*.tif --json"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
 ):
-    layout = Grouped if command in (reconstruct, check) else None
+    layout = Grouped if command in (reconstruct, check) else Once
     printing = command if command is schema else with_output(command)  # a schema is JSON
     told_last = "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in examples)])
     group.command(cls=layout, epilog=told_last)(printing)

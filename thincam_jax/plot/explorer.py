@@ -26,7 +26,7 @@ from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import GaussianNoise
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.lensless import psf as psfs
-from thincam_jax.lensless.accuracy.select import select_model
+from thincam_jax.lensless.accuracy.select import choose_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -201,7 +201,7 @@ class Explorer:
     def _about_the_psf(self, camera: LenslessCamera, light: dict[str, Any]) -> list[str]:
         """Changes by a cheaper model, and by the angle."""
         tolerance = self.values["tolerance"]
-        chosen = select_model(
+        chosen = choose_model(
             camera, tolerance=tolerance * _TOLERANCE.scale, pixel_integration=True, **light
         )
         method = PsfMethod(pixel_integration=True)
