@@ -207,6 +207,15 @@ def test_scenes_take_one_plane_or_several():
     assert len(Scene([plane, plane], Spectrum(500 * nm)).planes) == 2
 
 
+def test_a_wavelength_is_light_of_one_colour():
+    plane = ImagePlane(picture((3, 4)), 10.0, 1.0)
+    guessed = Scene(plane, wavelength=530 * nm)
+    assert eqx.tree_equal(guessed, Scene(plane, Spectrum(530 * nm)), Scene(plane, 530 * nm))
+    for light in ({}, {"spectrum": Spectrum(530 * nm), "wavelength": 530 * nm}):
+        with pytest.raises(TypeError, match=r"^give the light of a Scene once: a Spectrum, or .*$"):
+            Scene(plane, **light)
+
+
 def test_impossible_scenes():
     one, batch = ImagePlane(np.ones((3, 4)), 10.0, 1.0), ImagePlane(np.ones((2, 3, 4)), 20.0, 1.0)
     with pytest.raises(ValueError, match="planes is empty"):

@@ -179,6 +179,7 @@ class Scene(Module):
 
     - `planes`: one `ImagePlane` or a sequence of them, with equal batch shapes.
     - `spectrum`: a `Spectrum` or one wavelength in mm.
+    - `wavelength`: mm, in place of `spectrum`.
 
     ```python
     import thincam_jax as tc
@@ -195,7 +196,17 @@ class Scene(Module):
     planes: tuple[ImagePlane, ...]
     spectrum: Spectrum
 
-    def __init__(self, planes: ImagePlane | Iterable[ImagePlane], spectrum: Spectrum | Number):
+    def __init__(
+        self,
+        planes: ImagePlane | Iterable[ImagePlane],
+        spectrum: Spectrum | Numbers | None = None,
+        *,
+        wavelength: Number | None = None,
+    ):
+        lights = [light for light in (spectrum, wavelength) if light is not None]
+        if len(lights) != 1:
+            raise TypeError("give the light of a Scene once: a Spectrum, or wavelength= in mm")
+        (spectrum,) = lights
         planes = (planes,) if isinstance(planes, ImagePlane) else planes
         if not isinstance(planes, Iterable) or not all(isinstance(p, ImagePlane) for p in planes):
             raise TypeError(f"planes is {checks.shown(planes)}; give an ImagePlane, or several")

@@ -10,14 +10,24 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.checks import Number, Position
+from thincam_jax._core.checks import Number, Numbers, Position
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.precision import allow, as_complex, cast, precision_of
+from thincam_jax._core.precision import (
+    allow,
+    as_complex,
+    cast,
+    flat_root,
+    precision_of,
+    product,
+    squared_modulus,
+    turn_phasor,
+)
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.digits import require_digits
@@ -59,6 +69,8 @@ AVERAGES = 1 / 4
 _SLOW = 1e10
 # Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
 _IN_CELL, _UNKNOWN_CELL = 16, 7
+# Directions of fringes in the mean of `mtf`.
+_DIRECTIONS = 32
 
 
 @checked
@@ -110,7 +122,7 @@ def psf(
     print(h.shape)  # (24, 32)
     ```
 
-    **See also**: `otf`, `select_model`, `capture`.
+    **See also**: `otf`, `choose_model`, `capture`.
     """
     path = camera.path(wavelength, object_distance, at)
     return _evaluate(_psf, camera, path, as_method(model, pixel_integration))
@@ -178,6 +190,70 @@ def otf(
     """
     path = camera.path(wavelength, object_distance, at)
     return _evaluate(_otf, camera, path, as_method(model, pixel_integration))
+
+
+@checked
+def mtf(
+    camera: LenslessCamera,
+    *,
+    wavelength: Number,
+    object_distance: Number = math.inf,
+    frequencies: Numbers | None = None,
+    model: Model | PsfMethod = "separable",
+    pixel_integration: bool = True,
+) -> Float[Array, " frequency"]:
+    r"""Modulation transfer function: contrast of the shadow of fringes, over their frequency.
+
+    .. math:: \mathrm{MTF}(\rho) = \frac{1}{H(0)} \sqrt{\langle |H(\rho\cos\vartheta,
+        \rho\sin\vartheta)|^2 \rangle_\vartheta}
+
+    over 32 directions of a half turn, with H of `otf` on the sensor's area: 1 at zero frequency.
+    Other arguments are described at `psf`.
+
+    - `frequencies`: ρ on the sensor, cycles/mm, at most 1/(2 pitch); by default 64 from 0 to there.
+
+    **Returns** (frequency,), dimensionless, differentiable as `psf` is.
+
+    **Errors**: those of `psf`; ValueError for frequencies that the pixels do not resolve.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    contrast = tc.mtf(camera, wavelength=500 * nm, frequencies=[2.0, 4.0])
+    print(contrast.shape)  # (2,)
+    ```
+
+    **See also**: `otf`, `plot.otf`, `design.transfer.modulation_transfer`.
+    """
+    grid = camera.sensor.grid
+    given = jnp.linspace(0.0, 0.5, 64) / grid.pitch if frequencies is None else frequencies
+    rho = jnp.ravel(checks.array("frequencies", given)).astype(grid.pitch.dtype)
+    if not checks.holds_traced(rho, grid.pitch):
+        most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
+        checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
+    h = psf(
+        camera,
+        wavelength=wavelength,
+        object_distance=object_distance,
+        model=model,
+        pixel_integration=pixel_integration,
+    )
+    return _contrast(h, grid, rho)
+
+
+@jax.jit
+def _contrast(h: Float[Array, "y x"], grid: Grid, rho: Float[Array, " n"]) -> Float[Array, " n"]:
+    turns = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    along = (np.asarray(part(turns), h.dtype) for part in (np.sin, np.cos))
+    rows, columns = (
+        turn_phasor(jnp.ravel(rho[:, None] * part)[:, None] * place)
+        for part, place in zip(along, (grid.y, grid.x), strict=True)
+    )
+    power = squared_modulus(jnp.sum(product(rows, as_complex(h)) * columns, axis=1))
+    return flat_root(jnp.mean(power.reshape(-1, _DIRECTIONS), axis=1)) / jnp.sum(h)
 
 
 def _irradiance(

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from thincam_jax.hardware import Camera, CameraSettings, Frame
-from thincam_jax.hardware.base import Identity
+from thincam_jax.hardware import Camera, CameraSettings
+from thincam_jax.hardware.base import Frame, Identity
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 
 
