@@ -11,7 +11,7 @@ import thincam_jax as tc
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
 from thincam_jax.plot.studies import _by_synthesis, _pairs_of_axes, draw_responses, enlarged_part
-from thincam_jax.studies.response import Limits, Response
+from thincam_jax.studies.response import Response, ResponseLimits
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_the_detail_of_a_chart_holds_its_fine_groups():
 def test_panels_of_transfer_functions_end_past_their_limits_and_go_to_1():
     """Each panel ends just past its limits; its title gives the largest value above 1."""
     study = tiny.study()
-    limits = Limits(None, None, 9.0, 3.7)
+    limits = ResponseLimits(None, None, 9.0, 3.7)
     found = {
         m.name: Response(np.arange(50.0) / 4, np.linspace(1, 3 - 2 * n, 50), limits)
         for n, m in enumerate(study.methods)
@@ -69,7 +69,7 @@ def test_panels_of_transfer_functions_end_past_their_limits_and_go_to_1():
 
 def test_a_panel_without_limits_goes_past_the_nyquist_frequency():
     study = tiny.study()
-    none = Response(np.arange(50.0) / 4, np.ones(50), Limits(None, None, 0.0, 0.0))
+    none = Response(np.arange(50.0) / 4, np.ones(50), ResponseLimits(None, None, 0.0, 0.0))
     panels = draw_responses(study, {m.name: none for m in study.methods}).axes
     assert panels[1].get_xlim()[1] == pytest.approx(1.08 * 0.5 / study.pitch)
     assert [t.get_text() for t in panels[1].get_legend().get_texts()] == [
@@ -84,7 +84,7 @@ def test_methods_of_the_same_captures_and_sums_share_a_transfer_function():
     twin = dataclasses.replace(first, name="twin")
     other = dataclasses.replace(study, methods=(*study.methods, twin))
     responses = {
-        m.name: Response(np.arange(3.0), np.full(3, float(n)), Limits(None, None, 1.0, 1.0))
+        m.name: Response(np.arange(3.0), np.full(3, float(n)), ResponseLimits(None, None, 1.0, 1.0))
         for n, m in enumerate(other.methods)
     }
     panels = _by_synthesis(other, responses)

@@ -16,7 +16,7 @@ from hardware.memory_rig import World, by_rows, fiducial_plan
 from thincam_jax._core.capture_store import CaptureStoreError
 from thincam_jax.hardware import CameraSettings, open_rig
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.plan import WHITE, Plan, canonical_json
+from thincam_jax.hardware.acquisition.plan import WHITE, AcquisitionPlan, canonical_json
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.plans import scene
@@ -278,7 +278,7 @@ def test_hashes_of_plans_stay_as_they_were(tmp_path):
     plan = scene(WHITE, CameraSettings(0.1, Region(1, 2, 3, 4)))
     for later in ("black_level", "binning", "trigger"):
         assert f'"{later}"' not in plan.as_json()
-    assert Plan.from_json(plan.as_json()) == plan
+    assert AcquisitionPlan.from_json(plan.as_json()) == plan
     assert plan.hash.startswith("d92cc4a7cc32bbd7")
     other = scene(WHITE, CameraSettings(0.1, black_level=64.0, binning=2, trigger="Line0"))
-    assert Plan.from_json(other.as_json()).settings == other.settings
+    assert AcquisitionPlan.from_json(other.as_json()).settings == other.settings

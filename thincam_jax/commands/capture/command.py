@@ -23,7 +23,7 @@ from thincam_jax.commands.terminal import (
 if TYPE_CHECKING:
     from thincam_jax.commands.capture.config import CaptureConfig
     from thincam_jax.commands.capture.run import Taken
-    from thincam_jax.hardware.acquisition.plan import Pattern, Plan
+    from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern
     from thincam_jax.hardware.acquisition.rig import Rig
     from thincam_jax.hardware.virtual.rig import VirtualRig
 
@@ -169,7 +169,7 @@ def known_drivers(connected: bool = False, asked: str | None = None) -> list[str
     return registry.driver_report() + there
 
 
-def build_plan(config: "CaptureConfig") -> "Plan":
+def build_plan(config: "CaptureConfig") -> "AcquisitionPlan":
     """The plan of a file, with its settings."""
     from thincam_jax.commands.capture.run import picture_levels
     from thincam_jax.hardware.base import CameraSettings
@@ -186,7 +186,7 @@ def build_plan(config: "CaptureConfig") -> "Plan":
 
 
 @contextlib.contextmanager
-def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
+def opened(config: "CaptureConfig", plan: "AcquisitionPlan") -> Iterator["Rig"]:
     """The rig of a file with its devices open, its stage homed.
 
     **Errors**: ConfigError for options of a driver, and for what the display cannot show.

@@ -11,7 +11,7 @@ from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, fra
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.text import of_error
 from thincam_jax.hardware.acquisition.journal import frame_records, read_journal
-from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
+from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge_exposures
@@ -29,7 +29,7 @@ class Acquisition:
     """
 
     path: Path
-    plan: Plan
+    plan: AcquisitionPlan
     settings: tuple[CameraSettings, ...]
     bits: int
     sensor_shape: tuple[int, int]
@@ -137,7 +137,7 @@ def read_acquisition(path: str | Path) -> Acquisition:
     attributes = store.attributes
     try:
         begun = dict(attributes["acquisition"])
-        plan = Plan.from_json(read_regular(path / PLAN).decode("utf-8"))
+        plan = AcquisitionPlan.from_json(read_regular(path / PLAN).decode("utf-8"))
         settings = tuple(settings_from(record) for record in begun.pop("settings"))
         if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):
             raise ValueError("its plan is another one")

@@ -64,7 +64,7 @@ class GreyLevels:
             raise ValueError(f"{path} holds no table of grey levels: {error}") from error
 
 
-class Screen(Display):
+class GreyLevelDisplay(Display):
     """A display of 256 levels, with `grey_levels` in equal steps of the irradiance."""
 
     def __init__(self, grey_levels: GreyLevels | None = None):

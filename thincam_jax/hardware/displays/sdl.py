@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax.hardware.base import Connected, Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
 from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
 
 with warnings.catch_warnings():
@@ -20,7 +20,7 @@ _GREY = np.uint32(0x010101)  # red, green and blue alike
 _NOT_SHOWN = sdl2.SDL_WINDOW_HIDDEN | sdl2.SDL_WINDOW_MINIMIZED
 
 
-class SdlDisplay(Screen):
+class SdlDisplay(GreyLevelDisplay):
     """A borderless window without a cursor, pixel by pixel.
 
     `show` returns after the monitor's next refresh if the driver supports `vsync`. Only the thread

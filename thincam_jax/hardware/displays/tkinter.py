@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
 from thincam_jax.hardware.errors import Disconnected, NotFound
 
 
-class TkinterDisplay(Screen):
+class TkinterDisplay(GreyLevelDisplay):
     """A borderless window. It waits for the window system, not for the monitor's next refresh.
 
     Only the thread that opened it may use it.
