@@ -178,6 +178,7 @@ def test_a_name_that_is_not_there():
         (tc.measured, "read_mask", "read_pixel_map"),
         (tc.lensless, "Path", "LightPath"),
         (tc.waveguide, "plan", "plan_screen"),
+        (tc.hardware, "read_acquisition", "Acquisition"),
     ],
 )
 def test_a_former_name_leads_to_the_one_of_today(package, name, nearest):

@@ -102,7 +102,7 @@ def psf_stack(
 
 @checked
 def hadamard(series: "HadamardSeries", settings: CameraSettings) -> AcquisitionPlan:
-    """The frames of a calibration by Hadamard patterns, which `open_captures` reads.
+    """The frames of a calibration by Hadamard patterns, which `HadamardCaptures.load` reads.
 
     The dark frames of the series are spread evenly among the patterns, the first one first.
     """

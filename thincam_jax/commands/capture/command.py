@@ -258,17 +258,17 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
 
     from thincam_jax._core.files import read_json
     from thincam_jax.commands.capture.run import Taken, picture_levels
-    from thincam_jax.hardware.acquisition.read import read_acquisition
+    from thincam_jax.hardware.acquisition.read import Acquisition
     from thincam_jax.hardware.displays.grey_levels import measured_levels
     from thincam_jax.hardware.displays.patterns import pattern_levels
     from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Electronics
-    from thincam_jax.measured.calibration import open_captures
+    from thincam_jax.measured.calibration import HadamardCaptures
     from thincam_jax.studies.rig import CountingCamera, RigFrames
 
-    found, kind = read_acquisition(store), config.plan.kind
+    found, kind = Acquisition.load(store), config.plan.kind
     camera, variance, calibration = None, None, None
     if kind in ("hadamard", "grey_levels"):
-        calibration = open_captures(store) if kind == "hadamard" else measured_levels(found)
+        calibration = HadamardCaptures.load(store) if kind == "hadamard" else measured_levels(found)
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
     elif kind == "scene" or config.alignment:
         frames, variance = found.scene()

@@ -76,7 +76,7 @@ class AcquisitionPlan:
 
     - `name`: its purpose, such as "method_b".
     - `facts`: numbers and texts stored with the captures. `stage_zero` is the distance, mm, at the
-      stage's position 0. With `series`, as in `hadamard`, `open_captures` reads the store. With
+      stage's position 0. With `series`, as in `hadamard`, it makes `HadamardCaptures`. With
       `bracket`, frames of all but the shortest exposure may be saturated.
 
     **Errors**: ValueError for no steps, numbers that point outside of the tables, and what JSON

@@ -40,7 +40,7 @@ class SdlDisplay(GreyLevelDisplay):
         grey_levels: str = ""
 
     def __init__(self, options: Options):
-        super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
+        super().__init__(GreyLevels.load(options.grey_levels) if options.grey_levels else None)
         self._window: Any = None
         for hint, value in (
             (sdl2.SDL_HINT_NO_SIGNAL_HANDLERS, b"1"),  # Ctrl-C stays with Python

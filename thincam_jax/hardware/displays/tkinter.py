@@ -30,7 +30,7 @@ class TkinterDisplay(GreyLevelDisplay):
         grey_levels: str = ""
 
     def __init__(self, options: Options):
-        super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
+        super().__init__(GreyLevels.load(options.grey_levels) if options.grey_levels else None)
         try:
             self._root = tkinter.Tk()
         except tkinter.TclError as error:
