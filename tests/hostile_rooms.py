@@ -30,7 +30,7 @@ from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
 from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
-from thincam_jax.hardware.acquisition.plan import Plan, Step
+from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
@@ -232,11 +232,11 @@ RIGS = (
     call(plans.psf_stack, mask=PLATE, depths=[5.0, 6.5], settings=SETTINGS, stage_zero=1.0),
     call(plans.hadamard, series=SERIES, settings=SETTINGS),
     call(
-        at_once(Plan, "patterns", "settings", "steps"),
+        at_once(AcquisitionPlan, "patterns", "settings", "steps"),
         name="a",
         patterns=PLATE,
         settings=SETTINGS,
-        steps=call(Step, pattern=0, position=1.0, settings=0, dark=False),
+        steps=call(AcquisitionStep, pattern=0, position=1.0, settings=0, dark=False),
         facts={"a": 1.0},
     ),
     call(

@@ -9,7 +9,7 @@ import thincam_jax as tc
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
 from thincam_jax.plot.studies import _by_synthesis, enlarged_part
-from thincam_jax.studies.response import Limits, Response
+from thincam_jax.studies.response import Response, ResponseLimits
 
 
 def test_the_detail_of_a_chart_holds_its_fine_groups():
@@ -30,7 +30,7 @@ def test_methods_of_the_same_captures_and_sums_share_a_transfer_function():
     twin = dataclasses.replace(first, name="twin")
     other = dataclasses.replace(study, methods=(*study.methods, twin))
     responses = {
-        m.name: Response(np.arange(3.0), np.full(3, float(n)), Limits(None, None, 1.0, 1.0))
+        m.name: Response(np.arange(3.0), np.full(3, float(n)), ResponseLimits(None, None, 1.0, 1.0))
         for n, m in enumerate(other.methods)
     }
     panels = _by_synthesis(other, responses)

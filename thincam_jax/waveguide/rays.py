@@ -160,7 +160,7 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
     return BraggRays(slope, across, wavelength, guided, left, fault)
 
 
-class Path(eqx.Module):
+class RayPath(eqx.Module):
     """Where rays meet the top hologram, (*pixel, 2), the bottom one and the object's plane, (order,
     *pixel, 2), (x, y) mm."""
 
@@ -171,7 +171,7 @@ class Path(eqx.Module):
 
 def object_points(
     camera: SeeThroughCamera, rays: BraggRays, distance: Float[Array, ""], orders: int
-) -> Path:
+) -> RayPath:
     """Paths from the lens to the object, for each order."""
     width = camera.screen.glass_thickness
     bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
@@ -180,7 +180,7 @@ def object_points(
     odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
     guided = jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
     moved = on_object(camera, rays.slope, guided + 2 * width * crossing)
-    return Path(top, top + guided, straight_on(camera, rays.slope, distance) + moved)
+    return RayPath(top, top + guided, straight_on(camera, rays.slope, distance) + moved)
 
 
 def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:

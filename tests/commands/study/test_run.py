@@ -28,7 +28,7 @@ from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import page, run_study
 from thincam_jax.studies.evaluate import Resolved, Scores, evaluate_method
-from thincam_jax.studies.response import Limits, method_response
+from thincam_jax.studies.response import ResponseLimits, method_response
 from thincam_jax.studies.result import MethodScores, StudyScores, findings
 from thincam_jax.studies.simulate import take
 from thincam_jax.studies.study import Published
@@ -469,7 +469,7 @@ def method(psnr, published_psnr, resolved, published_resolved):
     return MethodScores(
         4,
         psnr,
-        Limits(None, None, 9.0, 3.7),
+        ResponseLimits(None, None, 9.0, 3.7),
         {"picture": Scores(20.0, 0.5, 0.1), "chart": Scores(20.0, 0.5, 0.1, chart)},
         Published(published_psnr, published_resolved),
     )

@@ -23,8 +23,8 @@ _NEAR = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Plan by which `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
+class CapturePlan:
+    """Plan by which `capture` computes a scene within a tolerance; by `plan_capture`.
 
     Print it for a table. It holds for scenes with the same planes and wavelengths as the one that
     it was made for and images like its, and for cameras within 1 % of its own, at any phase of the
@@ -109,7 +109,7 @@ class Plan:
         return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
 
 
-def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "*batch y x"]:
+def run_plan(plan: CapturePlan, camera: LenslessCamera, scene: Scene) -> Float[Array, "*batch y x"]:
     """The noise-free capture: planes mixed, convolved with the planned PSFs, and added up."""
     require_fits(plan, camera, scene)
     own = precision_of(camera.sensor.pitch)
@@ -133,7 +133,7 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
     return cast(total, own)
 
 
-def require_fits(plan: Plan, camera: LenslessCamera, scene: Scene) -> None:
+def require_fits(plan: CapturePlan, camera: LenslessCamera, scene: Scene) -> None:
     """ValueError where camera or scene are not the plan's. Traced numbers are not checked."""
     other = _other_numbers(plan.camera, camera)
     if other:
