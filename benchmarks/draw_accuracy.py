@@ -1,4 +1,4 @@
-"""The figure and the table of costs of `thincam bench accuracy`, from its accuracy.json.
+"""The figure and the table of costs of `benchmarks/accuracy.py`, from its accuracy.json.
 
     python benchmarks/draw_accuracy.py runs/NAME-accuracy/accuracy.json
 
@@ -14,8 +14,6 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-
-from thincam_jax.studies.psf_accuracy import label, words
 
 # Models are told apart by marker, precisions by filling, sizes by grey.
 _MARKERS = {
@@ -37,6 +35,17 @@ _WORST = 3.0  # relative errors above this are written, not drawn
 _LINEAR_DB = 0.01  # losses below this are drawn to a linear scale
 
 Point = tuple[float, float]
+
+
+def words(model: str) -> str:
+    """A model's name as it is read."""
+    return model.replace("rayleigh_s", "Rayleigh-S").replace("_", " ")
+
+
+def label(model: str, precision: str, oversampling: int | None) -> str:
+    """A candidate in words, such as "angular spectrum ×3, float32"."""
+    samples = f" ×{oversampling}" if oversampling else ""
+    return f"{words(model)}{samples}, {precision}"
 
 
 def draw(results: dict[str, Any]) -> Figure:

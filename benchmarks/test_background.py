@@ -6,7 +6,9 @@ default for both. `THINCAM_COUNT` (2) photographs.
 """
 
 import dataclasses
+import time
 
+import jax
 import numpy as np
 import pytest
 from test_prior import CASES, COUNT, PHOTOGRAPHS, SIDE
@@ -57,3 +59,33 @@ def test_background(name, capsys):
         print(f"\n| {name} | {' | '.join(cells)} |")
     assert (found[1, :, 1] > found[0, 0, 1] - 0.15).all()  # nothing lost at 100 iterations
     assert (found[1, :, 2] > found[1, :, 1] - 0.2).all()  # more of them make nothing worse
+
+
+SOLVERS = {
+    "AdmmTV": tc.AdmmTV(iterations=100),
+    "Fista": tc.Fista(iterations=100),
+    "PlugAndPlay": tc.PlugAndPlay(),
+    "Ridge": tc.Ridge(0.3),
+}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("name", NAMES)
+def test_cost_where_there_is_none(name, solver, capsys):
+    """Time and quality of a background that is found and is zero, beside `background=0`."""
+    if not PHOTOGRAPHS.exists():
+        pytest.skip(f"needs photographs in {PHOTOGRAPHS}")
+    picture = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images[0]
+    recording, truth = CASES[name]()(picture, "30", 0)
+    seconds, scores = {0.0: [], None: []}, {}
+    for _ in range(4):  # the first compiles
+        for background, times in seconds.items():
+            seen = dataclasses.replace(recording, background=background)
+            start = time.process_time()
+            image = jax.block_until_ready(tc.reconstruct(seen, SOLVERS[solver]).image)
+            times.append(time.process_time() - start)
+            scores[background] = score(image, truth)
+    known, found = (min(times[1:]) for times in seconds.values())
+    with capsys.disabled():
+        cells = f"{found / known:.2f} | {scores[None] - scores[0.0]:+.2f}"
+        print(f"\n| {name} | {solver} | {cells} |")

@@ -64,7 +64,7 @@ CALLS = {
     "averaged": "tc.psf(camera, **light, pixel_integration=True)",
     "plot": "pyplot.close(tc.plot.psf(camera, **light))",
     "capture": "tc.capture(camera, scene, key=0, noise=noise)",
-    "select_model": "tc.select_model(camera, tolerance=0.01, **light).method",
+    "choose_model": "tc.choose_model(camera, tolerance=0.01, **light).method",
     "reconstruct": "tc.reconstruct(recording).image",
 }
 

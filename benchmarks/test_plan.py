@@ -67,9 +67,9 @@ def timed(function, rounds):
 @pytest.mark.benchmark(group="plan")
 def test_plan(benchmark, capsys):
     camera, scene = thesis_camera(), deep_scene()
-    tc.plan(camera, scene, tolerance=TOLERANCE, over_field=False)  # compiles
+    tc.plan_capture(camera, scene, tolerance=TOLERANCE, over_field=False)  # compiles
     start = time.perf_counter()
-    plan = tc.plan(camera, scene, tolerance=TOLERANCE, over_field=False)
+    plan = tc.plan_capture(camera, scene, tolerance=TOLERANCE, over_field=False)
     planning = time.perf_counter() - start
     running, planned = timed(lambda: tc.capture(camera, scene, model=plan), 5)
     everything, _ = timed(lambda: tc.capture(camera, scene), 1)

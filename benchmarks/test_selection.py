@@ -1,4 +1,4 @@
-"""Is the model that `select_model` chooses the fastest that is accurate enough? Measured times.
+"""Is the model that `choose_model` chooses the fastest that is accurate enough? Measured times.
 
 100 random cameras in single precision, numbers log-uniform in wide ranges, on sensors of 64² to
 1024² pixels. Every closed form is timed in both precisions, `angular_spectrum` too on the smallest
@@ -95,7 +95,7 @@ def measure(camera, conditions):
 def judge(camera, conditions, tolerance, times, errors):
     """Whether the choice meets the tolerance, and its time over that of the fastest that does."""
     start = time.perf_counter()
-    choice = tc.select_model(camera, tolerance=tolerance, **conditions)
+    choice = tc.choose_model(camera, tolerance=tolerance, **conditions)
     took = time.perf_counter() - start
     way = (choice.method.model, choice.method.precision)
     met = errors.get(way, math.inf) <= tolerance

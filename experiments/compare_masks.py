@@ -9,6 +9,7 @@ before? At full size some six minutes of one core. Lengths are in mm.
 # sphinx_gallery_thumbnail_path = "images/which-mask.png"
 
 import os
+import sys
 from pathlib import Path
 
 import jax
@@ -23,9 +24,11 @@ from thincam_jax.imaging.targets.patterns import point_grid
 from thincam_jax.lensless import Path as LightPath
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence, random_cells
 from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
-from thincam_jax.studies.mask_captures import ComparedMask, Setting
-from thincam_jax.studies.mask_comparison import ComparedScene, MaskComparison, Tuning
 from thincam_jax.units import nm, um
+
+sys.path.append(str(Path(__file__).parent / "tools"))
+from mask_captures import ComparedMask, Setting
+from mask_comparison import ComparedScene, MaskComparison, Tuning, draw_error, draw_images
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": large pixels, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "compare_masks"
@@ -125,8 +128,8 @@ result = comparison.run(lambda step, total: print(step))
 
 print(result.table())
 print(result.table("linear"))
-result.plot_error().savefig(FIGURES / "error.png", dpi=110)
-result.plot_images().savefig(FIGURES / "images.png", dpi=110)
+draw_error(result).savefig(FIGURES / "error.png", dpi=110)
+draw_images(result).savefig(FIGURES / "images.png", dpi=110)
 
 # %%
 # What the transfer function says before

@@ -19,8 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.hardware import CameraSettings, acquire, read_acquisition
-from thincam_jax.hardware.acquisition.plan import method_b, zone_plate
+from thincam_jax.hardware import CameraSettings, acquire, plans, read_acquisition
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.virtual import VirtualRig
 from thincam_jax.hardware.virtual.optics import ModulatorOptics
@@ -68,9 +67,9 @@ drivers = {
 # For each step of the plan: move, show, settle, flush, trigger, check, keep. The virtual rig
 # computes what its camera will see while the pattern is shown.
 
-mask = zone_plate(25.0, side * display_pitch)
+mask = plans.zone_plate(25.0, side * display_pitch)
 settings = CameraSettings(exposure=20e-3, pixel_format="Mono12")
-plan = method_b(mask, (25.0, 21.0), settings, dark_frames=1).at_position(0.0)
+plan = plans.method_b(mask, (25.0, 21.0), settings, dark_frames=1).at_position(0.0)
 with (
     tempfile.TemporaryDirectory() as folder,
     tc.hardware.open_rig(drivers, display_pitch, virtual) as rig,

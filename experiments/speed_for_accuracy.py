@@ -62,7 +62,7 @@ mask = tc.FresnelZoneAperture(beta=25.0, width=width)
 camera = tc.LenslessCamera(mask, tc.Sensor((rows, columns), width / columns), distance=6.5)
 light = {"wavelength": 500 * nm, "object_distance": 250.0}
 
-choice = tc.select_model(camera, tolerance=0.1, **light)
+choice = tc.choose_model(camera, tolerance=0.1, **light)
 print(f"{choice.method.model}, {choice.method.precision}: predicted {choice.predicted_error:.3f}")
 print(*choice.reasons, sep="\n")
 
@@ -72,7 +72,7 @@ print(*choice.reasons, sep="\n")
 # mask's edge, β²λd·r²/π (Eq 3.26), is 5 rad.
 
 tolerances = (0.3, 0.1, 0.03, 1e-2, 1e-4, 1e-6)
-choices = {t: tc.select_model(camera, tolerance=t, **light) for t in tolerances}
+choices = {t: tc.choose_model(camera, tolerance=t, **light) for t in tolerances}
 for tolerance, choice in choices.items():
     method = choice.method
     print(f"{tolerance:.0e}: {method.model}, {method.precision}, {choice.predicted_error:.1e}")
@@ -195,7 +195,7 @@ figure.savefig(FIGURES / "precision.png", dpi=110)
 # A whole capture
 # ---------------
 #
-# `tc.plan` does the same for a scene. This one has 8 planes from 0.1 to 10 m and 11 wavelengths:
+# `tc.plan_capture` does it for a scene. This one has 8 planes from 0.1 to 10 m and 11 wavelengths:
 # 88 PSFs in full. A plan computes a few of them and writes the others as weighted sums of these,
 # so that planes are added up before they are convolved. Both have the PSF and the light of the axis
 # everywhere, as `tc.capture` without a plan has them.
@@ -213,7 +213,7 @@ full = tc.capture(small, scene)
 
 # %%
 asked = (0.1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4) if SIZE == "full" else (1e-2, 1e-3)
-plans = {t: tc.plan(small, scene, tolerance=t, over_field=False) for t in asked}
+plans = {t: tc.plan_capture(small, scene, tolerance=t, over_field=False) for t in asked}
 missed, taken = [], []
 for plan in plans.values():
     missed.append(relative_error(tc.capture(small, scene, model=plan), full))

@@ -76,7 +76,7 @@ camera = tc.LenslessCamera(mask, tc.Sensor(SHAPE, PITCH), DISTANCE)
 light = {"wavelength": WAVELENGTH, "pixel_integration": True}
 exact = np.asarray(tc.psf(camera, **light))
 shadow = np.asarray(tc.psf(camera, model="geometric", **light))
-choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=1e-3, pixel_integration=True)
+choice = tc.choose_model(camera, wavelength=WAVELENGTH, tolerance=1e-3, pixel_integration=True)
 print(f"{choice.method.model} in {choice.method.precision}: {choice.predicted_error:.1e}")
 print(f"without diffraction: {np.linalg.norm(shadow - exact) / np.linalg.norm(exact):.0%} off")
 

@@ -28,8 +28,9 @@ from thincam_jax.design.plate import Plate, Viewing, judge_plate
 from thincam_jax.design.ranking import score_design
 from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
-from thincam_jax.hardware.acquisition import plan as plans
+from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
+from thincam_jax.hardware.acquisition.plan import Plan, Step
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
@@ -48,8 +49,6 @@ from thincam_jax.measured.calibration.hadamard import hadamard_pattern, walsh_ha
 from thincam_jax.measured.calibration.start import PsfSearch
 from thincam_jax.measured.read import list_captures
 from thincam_jax.measured.write import log_text
-from thincam_jax.studies.mask_captures import ComparedMask, Setting
-from thincam_jax.studies.mask_comparison import ComparedScene, Tuning
 
 
 def space(base: Any, variable: Any, limits: Any) -> design.DesignSpace:
@@ -194,11 +193,6 @@ STUDIES = (
         ),
         target=TARGET,
     ),
-    call(at_once(ComparedMask, "masks"), masks=ZONES, sort="a", synthesis="separate"),
-    call(Setting, sensor=SENSOR, distance=6.5, field=(9, 12), width=1.2, read_noise=3.0),
-    call(
-        Tuning, scene=call(ComparedScene, image=IMAGE, prior="flat"), tau=(0.5, 1.0), iterations=60
-    ),
 )
 LEARNED = (
     call(TrainingOptions, steps=5, rate=1e-3, warm_up=2, averaging=0.9, seed=0, falling=0.5),
@@ -216,7 +210,7 @@ LEARNED = (
     ),
     call(learn.load, path="nothing", cameras=camera()),
     call(
-        learn.load_suggester, path="nothing", model=call(design.ResponseModel, space=SPACE, **SEEN)
+        learn.Suggester.load, path="nothing", model=call(design.ResponseModel, space=SPACE, **SEEN)
     ),
     call(denoised, network="shipped", image=IMAGE, sigma=0.1),
     call(tc.PlugAndPlay, denoiser="shipped", strength=1.0, iterations=2, tolerance=1e-3),
@@ -257,11 +251,11 @@ RIGS = (
     call(plans.psf_stack, mask=PLATE, depths=[5.0, 6.5], settings=SETTINGS, stage_zero=1.0),
     call(plans.hadamard, series=SERIES, settings=SETTINGS),
     call(
-        at_once(plans.Plan, "patterns", "settings", "steps"),
+        at_once(Plan, "patterns", "settings", "steps"),
         name="a",
         patterns=PLATE,
         settings=SETTINGS,
-        steps=call(plans.Step, pattern=0, position=1.0, settings=0, dark=False),
+        steps=call(Step, pattern=0, position=1.0, settings=0, dark=False),
         facts={"a": 1.0},
     ),
     call(

@@ -189,12 +189,12 @@ OPTICS = (
     ),
     *(
         call(
-            tc.select_model, camera=camera(m), wavelength=WAVE, object_distance=250.0, tolerance=0.1
+            tc.choose_model, camera=camera(m), wavelength=WAVE, object_distance=250.0, tolerance=0.1
         )
         for m in MASKS[:5]
     ),
     call(tc.predict_error, camera=camera(), wavelength=WAVE, model="closed_form"),
-    call(tc.plan, camera=camera(), scene=SCENE, tolerance=0.1),
+    call(tc.plan_capture, camera=camera(), scene=SCENE, tolerance=0.1),
     *(
         call(tc.capture, camera=camera(), scene=scene, key=3, noise=noise)
         for scene in (SCENE, PLANE)

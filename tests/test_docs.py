@@ -1,6 +1,7 @@
 """The pages say what is so: their examples run, and what they name is there."""
 
 import ast
+import inspect
 import json
 import operator
 import os
@@ -348,10 +349,9 @@ def test_picture_of_the_rooms_can_be_drawn(tmp_path):
 def test_learned_thesis_page(monkeypatch):
     """What the page says of the optics of both cameras; at small size, too, the thesis' planes are
     not told apart, and those here are."""
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
     page = (ROOT / "docs/measured/refocusing_thesis.md").read_text("utf-8")
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
-        script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
+        script = runpy.run_path(str(ROOT / "benchmarks/refocusing/thesis_refocusing.py"))
         thesis, optics = script["thesis_camera"], script["optics"]
         path = ROOT / "configs/learned_refocus.yaml"
         here = build_camera(load_experiment(path, (), "train"))
@@ -545,6 +545,10 @@ def test_versions_keep_few_names_and_these():
     assert len([name for name in promised() if name.count(".") == 1]) <= 60
     for name in promised():
         assert operator.attrgetter(name.removeprefix("thincam_jax."))(tc) is not None
+    rig = (ROOT / "docs/api/index.md").read_text("utf-8").split("functions of `tc.hardware.plans`:")
+    plans = {name: one for name, one in vars(tc.hardware.plans).items() if inspect.isfunction(one)}
+    made_there = [n for n, one in plans.items() if one.__module__ == tc.hardware.plans.__name__]
+    assert re.findall(r"`(\w+)`", rig[1].split("\n\n")[0]) == [n for n in made_there if n[0] != "_"]
 
 
 USERS = [path.read_text("utf-8") for path in sorted((ROOT / "experiments").glob("*.py"))]

@@ -356,7 +356,7 @@ IN_SINGLE = tc.PsfMethod("separable", "float32")
 
 
 def choice_of(name: str):
-    """The camera and the conditions that `select_model` takes."""
+    """The camera and the conditions that `choose_model` takes."""
     extreme = find(name)
     mask = tc.FresnelZoneAperture(
         extreme.beta, extreme.phase, width=extreme.width, centre=extreme.centre
@@ -396,7 +396,7 @@ def test_predicted_error(name):
 def test_choice_of_precision(name):
     """A tolerance that float32 cannot meet chooses float64, which does."""
     camera, conditions = choice_of(name)
-    choice = tc.select_model(camera, tolerance=1e-7, **conditions)
+    choice = tc.choose_model(camera, tolerance=1e-7, **conditions)
     assert (choice.method.model, choice.method.precision) == ("separable", "float64")
     assert choice.meets_tolerance
     assert error(find(name), np.float64) < 1e-7 < error_in_single(name)

@@ -48,7 +48,8 @@ def test_the_package_alone_and_units_are_light():
 def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
     """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
     modules, of_command = imported_in_turn(
-        "import thincam_jax as tc; tc.psf, tc.capture, tc.plan, tc.select_model, tc.reconstruct",
+        "import thincam_jax as tc\n"
+        "tc.psf, tc.capture, tc.plan_capture, tc.choose_model, tc.reconstruct",
         "import thincam_jax.commands.reconstruct.run",
     )
     assert "jax" in modules
@@ -60,7 +61,7 @@ def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
 
 
 HELP = [
-    *("--help", "--version", "run --help", "bench accuracy --help", "calibrate check --help"),
+    *("--help", "--version", "run --help", "calibrate check --help"),
     *(
         f"{command} --help"
         for command in ("reconstruct", "sweep", "design", "doctor", "init", "capture", "train")
@@ -136,7 +137,8 @@ def test_the_core_runs_without_any_extra(tmp_path):
         f"import sys; sys.modules |= dict.fromkeys({extras})\n"
         + as_command(f"run {file} --out {tmp_path / 'out'}")
         + f"""
-from thincam_jax.measured import CaptureFileError, read_image
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured import read_image
 try:
     read_image({str(tiff)!r})
 except CaptureFileError as error:
@@ -166,6 +168,19 @@ def test_a_name_that_is_not_there():
         _ = tc.reconstuct  # pyright: ignore
     with pytest.raises(AttributeError, match="did you mean find_designs?"):
         _ = tc.design.find_design  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "nearest"),
+    [
+        (tc, "select_model", "choose_model"),
+        (tc, "plan", "plan_capture"),
+        (tc.measured, "read_mask", "read_pixel_map"),
+    ],
+)
+def test_a_former_name_leads_to_the_one_of_today(package, name, nearest):
+    with pytest.raises(AttributeError, match=rf"did you mean .*\b{nearest}\b"):
+        getattr(package, name)
 
 
 def test_documented_paths_need_no_import_of_their_own():

@@ -27,7 +27,7 @@ MODULES = (
     *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
     *("learn.suggester_training", "learn.suggestions", "lensless.masks.reliefs"),
     *("measured.calibration.screen_fit", "measured.exposures", "measured.sensor"),
-    *("reconstruction.depth.find", "reconstruction.problem", "studies.mask_comparison"),
+    *("reconstruction.depth.find", "reconstruction.problem"),
     *("studies.response", "studies.study", "waveguide.colours"),
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )

@@ -15,7 +15,7 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
 - scenes: `ImagePlane`, `Scene`, `Spectrum`, `load_image`, `imaging.targets`
 - simulation: `psf`, `otf`, `mtf`, `capture`, `field_operator`, `GaussianNoise`,
   `PoissonGaussianNoise`
-- accuracy: `select_model`, `predict_error`, `plan`, `PsfMethod`
+- accuracy: `choose_model`, `predict_error`, `plan_capture`, `PsfMethod`
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
   `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV`, `PlugAndPlay` or `Learned`; `Stream`
 - calibration: `fit_psf`, `check_psf`, `refine`, `fit_separable`, `measured`

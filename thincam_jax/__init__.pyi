@@ -21,8 +21,8 @@ from .imaging.sensor import Sensor as Sensor
 from .imaging.targets.images import load_image as load_image
 from .learn.plug_and_play import PlugAndPlay as PlugAndPlay
 from .learn.refocusing.use import Learned as Learned
+from .lensless.accuracy.select import choose_model as choose_model
 from .lensless.accuracy.select import predict_error as predict_error
-from .lensless.accuracy.select import select_model as select_model
 from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.exposures import Exposures as Exposures
@@ -40,7 +40,7 @@ from .lensless.masks.redundant_arrays import (
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import PsfMethod as PsfMethod
-from .lensless.plan.make import plan as plan
+from .lensless.plan.make import plan_capture as plan_capture
 from .lensless.psf import mtf as mtf
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf

@@ -15,19 +15,11 @@ from typer.testing import CliRunner
 
 from helpers import ROOT, full_disk
 from thincam_jax._core import environment as installation
-from thincam_jax.commands import accuracy as benches
 from thincam_jax.commands import cli
 from thincam_jax.commands.cache import cache_state
 from thincam_jax.commands.kinds import examples
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
-from thincam_jax.studies.psf_accuracy import PsfAccuracy
-from thincam_jax.studies.psf_error_cost import (
-    AccuracyResult,
-    CaptureError,
-    ControlledCost,
-    ReconstructionCosts,
-)
 from thincam_jax.studies.result import StudyScores
 
 runner = CliRunner()
@@ -187,90 +179,9 @@ class TestExitCode2:
             assert "Traceback" not in result.output
         assert "No such option" in call("run", file, "--ouput", "x").stderr
 
-
-class TestBenchAccuracy:
-    def test_prints_the_results_and_where_they_are(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr(benches, "run_accuracy", lambda *_: RESULT)
-        result = call("bench", "accuracy", file, "--out", tmp_path / "out", "--size", 32)
-        assert result.exit_code == 0, result.output
-        row = next(line for line in result.stdout.splitlines() if "separable" in line)
-        assert "reference" in row
-        assert "a PSF error of 1 % costs pairs 0.2500 dB by a wrong β" in result.stdout
-        assert f"results: {tmp_path / 'out' / 'accuracy.json'}" in result.stdout
-
-    def test_default_folder_and_options(self, file, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        seen = []
-        monkeypatch.setattr(
-            benches, "run_accuracy", lambda *given: seen.append(given[:2]) or RESULT
-        )
-        options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
-        assert call("bench", "accuracy", file, *options).exit_code == 0
-        ((plan, folder),) = seen
-        assert (plan.sizes, max(plan.case.study.sensor.shape)) == ((32, 64), 48)
-        assert folder.path.as_posix() == "runs/other-accuracy"
-
-    def test_fault_in_the_file(self, file):
-        line = one_line(call("bench", "accuracy", file, "--set", "mask.width=5"))
-        assert line.startswith("--set mask.width=5: mask.width: 5 has no unit")
-
-    @pytest.mark.parametrize("option", ["--size", "--capture-size"])
-    @pytest.mark.parametrize("size", [0, 65])
-    def test_size(self, file, tmp_path, option, size):
-        out = tmp_path / "out"
-        line = one_line(call("bench", "accuracy", file, "--out", out, option, size))
-        assert line.startswith(
-            f"{option} = {size}: give a whole number from 1 to 64, the pixels of"
-        )
-        assert not out.exists()
-
-    def test_folder_of_somebody_else(self, file, tmp_path):
-        (tmp_path / "file").write_text("mine", "utf-8")
-        for out, hint in (
-            (tmp_path, "is not empty"),
-            (tmp_path / "file", "cannot be made a folder"),
-        ):
-            assert hint in one_line(call("bench", "accuracy", file, "--out", out))
-        assert (tmp_path / "file").read_text("utf-8") == "mine"
-
-    def test_interrupt(self, file, tmp_path, monkeypatch):
-        def interrupted(plan, folder, progress):
-            progress("64 pixels", 9)
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(benches, "run_accuracy", interrupted)
-        result = call("bench", "accuracy", file, "--out", tmp_path / "out")
-        assert result.exit_code == 130
-        assert result.stderr.splitlines() == ["thincam: interrupted; nothing is kept."]
-
-
-SEPARABLE = PsfAccuracy(
-    shape=(24, 32),
-    pitch_mm=0.04,
-    model="separable",
-    precision="float64",
-    oversampling=None,
-    status="run",
-    reason=None,
-    true_error=0.0,
-    predicted_error=1e-15,
-    seconds=0.01,
-    compile_seconds=1.0,
-    calls=3,
-    flops=1e6,
-    bytes=1000,
-)
-RESULT = AccuracyResult(
-    (SEPARABLE,),
-    (CaptureError("rayleigh_sommerfeld", "not run", "slow"),),
-    ReconstructionCosts(
-        "pairs",
-        None,
-        30.0,
-        (),
-        (ControlledCost("beta", 0.01, "run", None, 1e-4, 0.01, 1e-4, 1e-3, 29.75, 0.25),),
-    ),
-)
+    def test_an_option_of_one_value_given_twice(self):
+        line = call("examine", "a.tif", "--psf", "a.tif", "--psf", "b.tif").stderr
+        assert "--psf is given 2 times; give it once" in line
 
 
 def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
@@ -413,7 +324,6 @@ def test_doctor_tells_what_is_missing(monkeypatch):
     [
         (("--help",), ("run", "doctor", "thin computational cameras")),
         (("run", "--help"), ("--out", "--set", "a.b=value", "Ctrl-C", "Experiment file")),
-        (("bench", "accuracy", "--help"), ("--size", "--capture-size", "--out", "PSNR")),
         (("doctor", "--help"), ("versions", "devices")),
     ],
 )
@@ -444,7 +354,7 @@ def test_version():
     ("typed", "completed"),
     [
         ("thincam re", ["reconstruct"]),
-        ("thincam bench ", ["accuracy"]),
+        ("thincam calibrate ", ["check"]),
         ("thincam init des", [kind for kind in examples() if kind.startswith("des")]),
         ("thincam reconstruct --method a", ["auto", "admm-tv"]),
         ("thincam reconstruct --bayer R", ["RGGB"]),

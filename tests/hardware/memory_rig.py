@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from thincam_jax.hardware import Camera, CameraSettings, Display, Stage
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step, pictures, scene
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.base import Frame, Identity, Region
 from thincam_jax.hardware.errors import (
@@ -25,6 +25,7 @@ from thincam_jax.hardware.errors import (
     ProtocolError,
     Timeout,
 )
+from thincam_jax.hardware.plans import pictures, scene
 from thincam_jax.hardware.virtual.faults import Faults
 
 SHAPE = (6, 9)  # of sensor and display

@@ -64,6 +64,21 @@ def test_a_frame_is_shown_on_its_scale_with_full_pixels_in_red(world):
         assert red.mean() > 200 and max(green.mean(), blue.mean()) < 80
 
 
+def test_what_examination_finds_is_told_of_each_setting(world):
+    """A hot pixel and saturation; not again until a control is turned."""
+    y, x = np.indices(SHAPE)
+    world.texture = (1000 + 40 * y + 20 * x).astype(np.uint16)
+    world.texture[12, 20] = 4000
+    with world.rig(stage=False) as rig:
+        preview = Preview(rig, fiducial_plan(1, stage=False))
+        (hot,) = preview.view().lines[3:]
+        assert hot.startswith("capture frame: 1 hot or dead pixels are not used")
+        world.light = 2.5
+        assert preview.view().lines[3:] == (hot,)
+        preview.turn({"gain": 1.0})
+        assert "saturated" in " ".join(preview.view().lines[3:])
+
+
 def test_numbers_of_a_frame():
     """Blur lowers the focus, light does not change it; the histogram is over the full scale."""
     sharp = np.zeros(SHAPE, np.uint16) + 400

@@ -10,7 +10,7 @@ from design.setting import setup, thesis_design, two_betas
 
 from helpers import finite_difference
 from thincam_jax.design import DesignSpace, Polar, PowerLaw, ResponseModel, Variable
-from thincam_jax.learn import load_suggester, save_suggester, suggest
+from thincam_jax.learn import Suggester, suggest
 from thincam_jax.learn.suggester_training import SuggesterTraining, _levels, train_suggester
 from thincam_jax.learn.suggestions import propose
 from thincam_jax.reconstruction import phase_pairs
@@ -153,8 +153,8 @@ def test_training_errors():
 
 @pytest.mark.thorough
 def test_saved_and_loaded_answers_are_the_same(suggester, targets, tmp_path):
-    path = save_suggester(tmp_path / "two_betas.suggester", suggester)
-    loaded = load_suggester(path, MODEL)
+    path = suggester.save(tmp_path / "two_betas.suggester")
+    loaded = Suggester.load(path, MODEL)
     target = targets[0][0]
     expected = propose(suggester, target)
     before = propose._cache_size()
@@ -164,7 +164,7 @@ def test_saved_and_loaded_answers_are_the_same(suggester, targets, tmp_path):
 
 @pytest.mark.thorough
 def test_files_of_something_else(suggester, tmp_path):
-    path = save_suggester(tmp_path / "two_betas.suggester", suggester)
+    path = suggester.save(tmp_path / "two_betas.suggester")
     one = DesignSpace(thesis_design(), (Variable("beta", 8.0, 36.0, (0, 1, 2, 3)),))
     dim = setup(prior=PowerLaw(2.0))
     whole = path.read_bytes()
@@ -180,5 +180,5 @@ def test_files_of_something_else(suggester, tmp_path):
     )
     for file, space, data, message in cases:
         with pytest.raises(ValueError, match=message) as told:
-            load_suggester(file, ResponseModel(space, *data, RINGS))
+            Suggester.load(file, ResponseModel(space, *data, RINGS))
         assert "\n" not in str(told.value)

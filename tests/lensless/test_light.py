@@ -77,8 +77,8 @@ def test_a_capture_of_the_axis_says_that_it_has_no_response():
 def test_plans_decide_by_it():
     """At 3° cos⁴θ is 0.3 % off in the mean; a response of cos³⁰⁰θ is not left out."""
     scene = tc.Scene(tc.ImagePlane(np.ones((8, 12)), 250.0, 20.0), 500 * nm)
-    plain = tc.plan(camera(), scene, tolerance=0.02)
-    steep = tc.plan(camera(angular_response=300.0), scene, tolerance=0.02)
+    plain = tc.plan_capture(camera(), scene, tolerance=0.02)
+    steep = tc.plan_capture(camera(angular_response=300.0), scene, tolerance=0.02)
     assert plain.method.field_tolerance is None
     assert steep.method.field_tolerance == 1.0
 

@@ -15,7 +15,7 @@ import tifffile
 from imagecodecs import jpeg8_encode, png_encode
 
 from thincam_jax._core import memory
-from thincam_jax.measured import Raw, read_image, read_mask
+from thincam_jax.measured import Raw, read_image, read_pixel_map
 from thincam_jax.measured.raw import CaptureFileError
 from thincam_jax.measured.read import NonlinearWarning, read_images
 
@@ -373,9 +373,9 @@ def test_masks(tmp_path):
     write_npy(tmp_path / "a.npy", mask)
     PIL.Image.fromarray(mask.astype(np.uint8) * 7).save(tmp_path / "a.png")
     for name in ("a.npy", "a.png"):
-        found = read_mask(tmp_path / name)
+        found = read_pixel_map(tmp_path / name)
         assert found.dtype == bool
         np.testing.assert_array_equal(found, mask)
     write_npy(tmp_path / "a.npy", np.zeros((3, 4, 3), bool))
     with pytest.raises(CaptureFileError, match=r"give a map \(y, x\)"):
-        read_mask(tmp_path / "a.npy")
+        read_pixel_map(tmp_path / "a.npy")

@@ -64,18 +64,6 @@ def _commit() -> str | None:
     return None
 
 
-def machine() -> dict[str, Any]:
-    """The machine that times are measured on."""
-    device = jax.devices()[0]
-    return {
-        "platform": f"{platform.system()} {platform.machine()}",
-        "device_kind": device.device_kind,
-        "device_platform": device.platform,
-        "cores": usable_cores(),
-        "jax": jax.__version__,
-    }
-
-
 def machine_report() -> list[str]:
     """Lines with the machine, its precisions, and whether its compiled sums are right."""
     found = environment()

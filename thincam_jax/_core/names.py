@@ -11,7 +11,7 @@ def modules_of(package: str, names: Callable[[str], Any] | None = None) -> Any:
     """`__getattr__` of a package, by which `tc.imaging.operators` needs no import of its own.
 
     `names` gets the names of a lazy package. A module is imported at its first use. Any other name
-    is an `AttributeError` that tells the nearest one. A type checker sees `Any` and goes on to
+    is an `AttributeError` that tells the nearest ones. A type checker sees `Any` and goes on to
     report unknown names.
     """
 
@@ -23,8 +23,9 @@ def modules_of(package: str, names: Callable[[str], Any] | None = None) -> Any:
             return importlib.import_module(path)
         import difflib
 
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f": did you mean {near[0]}?" if near else ""
+        near = [one for one in known if one.startswith(name)]
+        near = (near or difflib.get_close_matches(name, known))[:3]
+        hint = f": did you mean {' or '.join(near)}?" if near else ""
         raise AttributeError(f"{package} has no name {name}{hint}", name=name)
 
     return attribute

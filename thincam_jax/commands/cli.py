@@ -19,13 +19,13 @@ from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
 from thincam_jax.commands.kinds import init, load_experiment
 from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
-from thincam_jax.commands.run import accuracy, design, run, train
+from thincam_jax.commands.run import design, run, train
 from thincam_jax.commands.sweep.command import sweep
-from thincam_jax.commands.terminal import WRONG_INPUT, reported, say, say_result, tell
+from thincam_jax.commands.terminal import reported, say, say_result
 
 ORDER = (
     *("init", "explain", "explore", "run", "preview", "capture", "examine", "reconstruct"),
-    *("calibrate", "sweep", "design", "train", "bench", "schema", "doctor"),
+    *("calibrate", "sweep", "design", "train", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -75,17 +75,18 @@ def with_output(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-class BenchGroup(TyperGroup):
-    """Commands of `thincam bench`; a file in place of one is refused with what to write."""
+class Once(TyperCommand):
+    """Refuses an option that is given twice and takes one value: the first would be lost."""
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args and args[0].endswith((".yaml", ".yml")):
-            tell(f"bench {args[0]}: write thincam bench accuracy {args[0]}")
-            raise typer.Exit(WRONG_INPUT)
-        return super().resolve_command(ctx, args)
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        for one in set(order):
+            if order.count(one) > 1 and not (one.multiple or one.is_flag or one.nargs != 1):
+                ctx.fail(f"{one.opts[0]} is given {order.count(one)} times; give it once")
+        return super().parse_args(ctx, args)
 
 
-class Grouped(TyperCommand):
+class Grouped(Once):
     """Options in groups, and nothing else: for a file, the command that takes it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -110,14 +111,10 @@ class Grouped(TyperCommand):
 app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None, cls=InOrder
 )
-bench = typer.Typer(
-    no_args_is_help=True, help="Measure what the models of a study cost.", cls=BenchGroup
-)
 # The callback keeps the name of a single command.
 calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
 calibrate.callback()(lambda: None)
 for group, command, *examples in (
-    (bench, accuracy, "bench accuracy study.yaml --size 64 --size 128"),
     (app, init, "init study", "init design --out mine.yaml"),
     (app, schema, "schema study > study.schema.json"),
     (app, explain, "explain study.yaml", "explain study.yaml --set noise.snr_db=40"),
@@ -140,11 +137,10 @@ for group, command, *examples in (
     (app, examine, "examine RAW.tif --psf PSF.tif", "examine CAPTURES/*.tif --json"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
 ):
-    layout = Grouped if command in (reconstruct, check) else None
+    layout = Grouped if command in (reconstruct, check) else Once
     printing = command if command is schema else with_output(command)  # a schema is JSON
     told_last = "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in examples)])
     group.command(cls=layout, epilog=told_last)(printing)
-app.add_typer(bench, name="bench")
 app.add_typer(calibrate, name="calibrate")
 
 

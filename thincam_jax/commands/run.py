@@ -1,4 +1,4 @@
-"""The commands `thincam run`, `design`, `train` and `bench accuracy`.
+"""The commands `thincam run`, `design` and `train`.
 
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
@@ -157,35 +157,3 @@ def train(
     if found.page is not None:
         say_result("report", found.page)
     say_result("network", found.network)
-
-
-def accuracy(
-    config: ConfigFile,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default runs/NAME-accuracy.")
-    ] = None,
-    size: Annotated[
-        list[int] | None,
-        typer.Option(help="Pixels along the sensor's longer side; give it once for each size."),
-    ] = None,
-    capture_size: Annotated[
-        int | None, typer.Option(help="The same for captures and reconstructions; default 256.")
-    ] = None,
-    set_: Overrides = None,
-) -> None:
-    """Measure every model's error and time.
-
-    And what an error of the PSF costs in PSNR. Writes accuracy.json.
-    """
-    with reported(lambda: "interrupted; nothing is kept."):
-        from thincam_jax.commands.accuracy import BenchFolder, check, run_accuracy
-        from thincam_jax.commands.kinds import load_study
-
-        study = load_study(config, tuple(set_ or ()), "the benchmark takes a study")
-        plan = check(study, tuple(size or ()), capture_size)
-        folder = BenchFolder.chosen(out, f"{study.name}-accuracy", study)
-        with counted(study.name) as progress:
-            result = run_accuracy(plan, folder, progress)
-    show(result.table())
-    say(result.reconstructions.verdict())
-    say_result("results", folder.path / "accuracy.json")

@@ -6,6 +6,7 @@ imports nothing of this; the libraries of the devices come with `thincam-jax[har
 """
 
 from thincam_jax._core.names import modules_of
+from thincam_jax.hardware import plans as plans
 from thincam_jax.hardware.acquisition.acquire import acquire as acquire
 from thincam_jax.hardware.acquisition.read import read_acquisition as read_acquisition
 from thincam_jax.hardware.acquisition.rig import open_rig as open_rig

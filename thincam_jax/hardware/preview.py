@@ -22,11 +22,15 @@ from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
 from thincam_jax.hardware.base import CameraSettings, Frame
 from thincam_jax.hardware.errors import HardwareError
 from thincam_jax.imaging.display import jpeg_bytes
+from thincam_jax.measured.examination import examine
+from thincam_jax.measured.options import Preparation
+from thincam_jax.measured.raw import Raw
 
 _LONGEST = 900  # pixels of the longer side of a shown frame
 _BINS = 64  # of the histogram
 _SPREAD, _GAIN = 10.0, 24.0  # how far the exposure is turned, and the gain, dB
 _SATURATED = (255, 40, 40)  # the colour of full pixels
+_EXAMINED = 3.0  # seconds after which a frame is examined again
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,8 @@ class Preview:
     - `image`: reconstruction of a frame (y, x) of the first pattern, as levels 0 to 1.
     - `folder`: folder of the frames that are kept.
 
-    The error of a device is shown as a line; an unplugged one is opened again.
+    The error of a device is shown as a line; an unplugged one is opened again. So is what `examine`
+    finds in a frame: in the first of new settings, and every 3 s.
     """
 
     captions = {
@@ -133,6 +138,8 @@ class Preview:
         self._position: float | None = None  # the stage stays where it is until it is turned
         self._best, self._seen = 0.0, time.monotonic()
         self._rate = 0.0
+        self._findings: tuple[str, ...] = ()
+        self._examined: tuple[float, dict[str, float]] = (-math.inf, {})
 
     def turn(self, values: dict[str, float]) -> None:
         """Set controls, each within its range; ValueError names one that does not exist."""
@@ -159,6 +166,7 @@ class Preview:
             f"Focus {numbers.focus:.3g}, best {self._best:.3g}.",
             f"Exposure {1000 * frame.exposure:.3g} ms, {self._rate:.1f} frames a second.",
         ]
+        lines += self._found(frame, now)
         if rest:
             lines.append(f"Kept as {self._keep(frame)}.")
         pictures = {"frame": jpeg_bytes(_shown(frame))}
@@ -166,6 +174,16 @@ class Preview:
             image = np.clip(self.image(frame.pixels.astype(np.float32)), 0, 1)
             pictures["image"] = jpeg_bytes(np.round(255 * image).astype(np.uint8))
         return FrameView(pictures, dict(self.values), tuple(lines), numbers.histogram)
+
+    def _found(self, frame: Frame, now: float) -> tuple[str, ...]:
+        """Findings in a frame, or in one of these settings that is not long ago."""
+        since, values = self._examined
+        if now - since > _EXAMINED or values != self.values:
+            raw = Raw(frame.pixels, frame.bit_depth, name="frame")
+            options = Preparation(bayer=self.settings.bayer)
+            self._findings = tuple(str(one) for one in examine([raw], options=options).findings)
+            self._examined = now, dict(self.values)
+        return self._findings
 
     @property
     def _pattern(self) -> int:

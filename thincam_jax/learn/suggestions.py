@@ -90,6 +90,33 @@ class Suggester(eqx.Module):
             signal = jax.nn.silu(layer(signal))
         return jax.nn.sigmoid(self.layers[-1](signal)).reshape(self.guesses, -1)
 
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write a trained suggester with its camera; whole or not at all."""
+        return write_arrays(path, self, _described(self))
+
+    @classmethod
+    @checked
+    def load(cls, path: str | os.PathLike[str], model: ResponseModel) -> "Suggester":
+        """Read a suggester that was trained for the space and camera of `model`.
+
+        **Errors**: CheckpointError (a ValueError), one line, for a file that is none or is damaged,
+        and for one that was trained for another space, camera, synthesis or frequencies, with the
+        first number that differs.
+        """
+        there = read_description(path)
+        if there.get("kind") != _KIND:
+            raise CheckpointError(f"{path} is no suggester; give a file that Suggester.save wrote")
+        fresh = cls(model, key=jax.random.key(0), **there["network"])
+        for name, here in json.loads(json.dumps(_described(fresh))).items():
+            if there.get(name) != here:
+                raise CheckpointError(
+                    f"{path} was trained for other {name}: {json.dumps(there.get(name))}, and here "
+                    f"they are {json.dumps(here)}; train a suggester for these"
+                )
+        loaded = read_weights(path, fresh)
+        _check_numbers(path, loaded.model, model)
+        return loaded
+
 
 class Proposal(eqx.Module):
     """Result of `propose`: points of the unit cube and their misfits, dB.
@@ -221,35 +248,6 @@ def suggest(suggester: Suggester, target: Numbers, *, tolerance_db: float = MATC
 
 
 _KIND = "suggester"
-
-
-@checked
-def save_suggester(path: str | os.PathLike[str], suggester: Suggester) -> Path:
-    """Write a trained suggester with its camera; whole or not at all."""
-    return write_arrays(path, suggester, _described(suggester))
-
-
-@checked
-def load_suggester(path: str | os.PathLike[str], model: ResponseModel) -> Suggester:
-    """Read a suggester that was trained for the space and camera of `model`.
-
-    **Errors**: CheckpointError (a ValueError), one line, for a file that is none or is damaged, and
-    for one that was trained for another space, camera, synthesis or frequencies, with the first
-    number that differs.
-    """
-    there = read_description(path)
-    if there.get("kind") != _KIND:
-        raise CheckpointError(f"{path} is no suggester; give a file written by save_suggester")
-    fresh = Suggester(model, key=jax.random.key(0), **there["network"])
-    for name, here in json.loads(json.dumps(_described(fresh))).items():
-        if there.get(name) != here:
-            raise CheckpointError(
-                f"{path} was trained for other {name}: {json.dumps(there.get(name))}, and here "
-                f"they are {json.dumps(here)}; train a suggester for these"
-            )
-    loaded = read_weights(path, fresh)
-    _check_numbers(path, loaded.model, model)
-    return loaded
 
 
 def _described(suggester: Suggester) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def capture(
     print(noisy.shape)  # (24, 32)
     ```
 
-    **See also**: `Scene`, `plan`, `reconstruct`.
+    **See also**: `Scene`, `plan_capture`, `reconstruct`.
     """
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
     if isinstance(model, Plan):

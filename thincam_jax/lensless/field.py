@@ -56,7 +56,7 @@ def field_operator(
     - `tolerance`: relative L2 error of the PSFs over the field, at most half of it by the
       polynomials, a quarter by the averages over pixels and the rest by the sum of convolutions.
       Where pixels hold some 200 fringes, averages leave more, which is reported. With 1 the PSF is
-      that of the axis, and the light that of every point: that serves most captures, see `plan`.
+      that of the axis, and the light that of every point, as most captures allow (`plan_capture`).
     - `model`: model of the PSFs, averaged over the pixels, see `psf`. Cells off both axes are
       sampled, with more samples by `PsfMethod("angular_spectrum", oversampling=...)`.
 
@@ -77,7 +77,7 @@ def field_operator(
     print(capture.shape)  # (20, 24)
     ```
 
-    **See also**: `psf`, `Recording`, `plan`.
+    **See also**: `psf`, `Recording`, `plan_capture`.
     """
     field_shape = checks.shape2d("field_shape", field_shape)
     tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))

@@ -123,7 +123,7 @@ class PsfMethod:
     h = tc.psf(camera, wavelength=500 * nm, model=fine)
     ```
 
-    **See also**: `psf`, `select_model`.
+    **See also**: `psf`, `choose_model`.
     """
 
     model: Model = "separable"

@@ -122,7 +122,7 @@ def psf(
     print(h.shape)  # (24, 32)
     ```
 
-    **See also**: `otf`, `select_model`, `capture`.
+    **See also**: `otf`, `choose_model`, `capture`.
     """
     path = camera.path(wavelength, object_distance, at)
     return _evaluate(_psf, camera, path, as_method(model, pixel_integration))

@@ -16,6 +16,7 @@ from thincam_jax.measured.raw import Raw
 
 _DIM, _LIT, _SATURATED, _BORDER, _COLOURED = 2.0, 25.0, 5.0, 10.0, 3.0  # %
 _TILES, _COARSE = 8, 64
+_FLAT = 0.1  # of a PSF's bright pixels
 # Unit and consequence, and what mends it.
 _TEXTS = {
     "plateau": "% of the pixels have the largest value, {}, and are not used; give {} to say so",
@@ -139,14 +140,16 @@ def _examined(raw: Raw, where: str, options: Preparation, found: list[Finding]) 
     is_psf, image, is_mosaic = where.startswith("PSF"), _grey(raw), _mosaic(raw, options)
     full, top, count = raw.full_scale, float(raw.pixels.max()), plateau(raw.pixels)
     level = full * (options.saturation or (1.0 if raw.bits else np.inf))
-    if count and options.saturation is None and top < level:
+    is_unsaid = options.saturation is None and top < level
+    if count and (is_unsaid or is_psf):
         bits = max(8, math.ceil(np.log2(top + 1)))  # of a camera
         given, most = ("", full) if 2**bits - 1 != top <= full else (f"--bits {bits}", 2**bits - 1)
         given += f" --saturation {0.99999 * top / most:.6f}" * (top < most or not given)
         share, words = 100 * count / raw.pixels.size, (f"{top:g}", given.strip())
-        kind, severe = ("flat", share > 1) if is_psf else ("plateau", False)
-        found.append(finding(kind, where, share, severe, *words))
-        level, raw = top, replace(raw, saturation=top)
+        bright = np.count_nonzero(raw.pixels > (top + float(np.median(raw.pixels))) / 2)
+        severe = bool(is_psf and count > _FLAT * bright)
+        found.append(finding("flat" if is_psf else "plateau", where, share, severe, *words))
+        level, raw = min(top, level), replace(raw, saturation=top) if is_unsaid else raw
     share = 100 * float(np.mean(raw.pixels >= level))
     if not is_psf and share > _SATURATED:
         found.append(finding("overexposed", where, share, share > 50))

@@ -80,7 +80,7 @@ def prepare(
        gives the variance. `psf_background` is that of the PSF where it differs; a PSF of another
        bit depth has its own, given or found. Negative values become 0.
     3. Saturated pixels (before the subtraction), `dead` ones, True in a map (y, x) of the sensor
-       (`read_mask`), and defective ones by the calibration are not valid.
+       (`read_pixel_map`), and defective ones by the calibration are not valid.
     4. Demosaicing, if the options name a Bayer pattern; then the capture's `crop`.
     5. The PSF onto the capture's pixels, with `psf_scale`.
     6. Exact means of square blocks of `downsample` pixels; remainders are cropped centrally.

@@ -116,7 +116,7 @@ def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str, facts: _Fac
 
 
 @checked
-def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
+def read_pixel_map(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
     """Read a map (y, x) from a one-channel image file, True where it is not zero.
 
     Such as a map of dead pixels. An NPY file may hold bool.

@@ -26,7 +26,7 @@ from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import GaussianNoise
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.lensless import psf as psfs
-from thincam_jax.lensless.accuracy.select import select_model
+from thincam_jax.lensless.accuracy.select import choose_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -37,7 +37,6 @@ from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.methods import reconstruct
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.wiener import Wiener
-from thincam_jax.studies.psf_accuracy import relative_error
 from thincam_jax.units import nm
 
 # Part of the sensor's width that the scene's image has.
@@ -202,7 +201,7 @@ class Explorer:
     def _about_the_psf(self, camera: LenslessCamera, light: dict[str, Any]) -> list[str]:
         """Changes by a cheaper model, and by the angle."""
         tolerance = self.values["tolerance"]
-        chosen = select_model(
+        chosen = choose_model(
             camera, tolerance=tolerance * _TOLERANCE.scale, pixel_integration=True, **light
         )
         method = PsfMethod(pixel_integration=True)
@@ -211,14 +210,14 @@ class Explorer:
         found = [
             f"A PSF within {tolerance:.3g} %: model {chosen.method.model}, predicted error "
             f"{chosen.predicted_error:.1e}; from the one drawn it differs by "
-            f"{relative_error(other, h):.2g}."
+            f"{_change(other, h):.2g}."
         ]
         if any(self.at):
             off = psfs.psf_about_ray(camera, **light, at=self.at, method=method)
             angle = self.values["angle"]
             found.append(
                 f"PSF and transfer function are about the ray at {angle:.3g}°, "
-                f"{relative_error(off, h):.2g} from the axis'; capture and image are of the axis."
+                f"{_change(off, h):.2g} from the axis'; capture and image are of the axis."
             )
         return found
 
@@ -310,6 +309,12 @@ def _zero(camera: LenslessCamera, light: dict[str, Any]) -> float | None:
     u = np.arange(profile.size) / (columns * float(camera.sensor.pitch))
     shadow = 1 + float(camera.distance) / light["object_distance"]
     return first_common_zero(u, [without_carrier(u, profile, float(mask.beta), shadow)])
+
+
+def _change(image: jax.Array, reference: jax.Array) -> float:
+    """‖image − reference‖₂ / ‖reference‖₂."""
+    exact = np.asarray(reference, float)
+    return float(np.linalg.norm(np.asarray(image, float) - exact) / np.linalg.norm(exact))
 
 
 def _stretched(image: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition import journal, recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
-from thincam_jax.hardware.acquisition.plan import hadamard, pictures
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.base import Frame, Region
@@ -43,6 +42,7 @@ from thincam_jax.hardware.errors import (
     Saturated,
     Timeout,
 )
+from thincam_jax.hardware.plans import hadamard, pictures
 from thincam_jax.measured.calibration import HadamardSeries, open_captures, recover_matrix
 from thincam_jax.measured.calibration.captures import resume_captures
 

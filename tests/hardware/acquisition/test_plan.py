@@ -6,11 +6,9 @@ import math
 import pytest
 from hardware.memory_rig import SETTINGS
 
-from thincam_jax.hardware.acquisition.plan import (
-    BLACK,
-    Pattern,
-    Plan,
-    Step,
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
+from thincam_jax.hardware.base import Region
+from thincam_jax.hardware.plans import (
     fringe_scan,
     hadamard,
     method_a,
@@ -18,7 +16,6 @@ from thincam_jax.hardware.acquisition.plan import (
     psf_stack,
     zone_plate,
 )
-from thincam_jax.hardware.base import Region
 from thincam_jax.measured.calibration import HadamardSeries
 
 MASK = zone_plate(25.0, 5.6)

@@ -16,9 +16,10 @@ from hardware.memory_rig import World, by_rows, fiducial_plan
 from thincam_jax._core.capture_store import CaptureStoreError
 from thincam_jax.hardware import CameraSettings, open_rig
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.plan import WHITE, Plan, canonical_json, scene
+from thincam_jax.hardware.acquisition.plan import WHITE, Plan, canonical_json
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.base import Region
+from thincam_jax.hardware.plans import scene
 from thincam_jax.hardware.virtual import VirtualRig
 from thincam_jax.hardware.virtual.rig import Electronics
 from thincam_jax.measured import Preparation, measure_sensor, prepare

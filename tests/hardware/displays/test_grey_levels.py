@@ -8,11 +8,11 @@ from hardware.displays.rig import Panel, PanelCamera
 
 from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.plan import grey_levels
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.displays.grey_levels import GreyLevels, linear_levels, measured_levels
 from thincam_jax.hardware.displays.patterns import pattern_levels
+from thincam_jax.hardware.plans import grey_levels
 
 SHAPE = 12, 20
 ALL = np.arange(256)

@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.hardware.acquisition.plan import (
-    BLACK,
-    Pattern,
-    levels_pattern,
-    pictures,
-    zone_plate,
-)
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
+from thincam_jax.hardware.plans import levels_pattern, pictures, zone_plate
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 PITCH = 0.036  # mm, the modulator of the thesis

@@ -35,7 +35,7 @@ def test_predicted_errors_are_at_least_the_true_ones(name, average):
     """Against 11 samples a pixel and a window of three times the width."""
     here = camera(name)
     light = {"wavelength": WAVELENGTH, "pixel_integration": average}
-    choice = tc.select_model(here, tolerance=0.05 if name == "cells" else 0.02, **light)
+    choice = tc.choose_model(here, tolerance=0.05 if name == "cells" else 0.02, **light)
     assert choice.method.model == "angular_spectrum" and choice.meets_tolerance
     finest = tc.PsfMethod("angular_spectrum", oversampling=11, mask_shape=(120, 128))
     best = tc.psf(here, model=finest, **light)
@@ -48,12 +48,12 @@ def test_predicted_errors_are_at_least_the_true_ones(name, average):
 
 @pytest.mark.thorough
 def test_a_choice_beyond_reach_says_so_and_traced_numbers_are_refused():
-    choice = tc.select_model(camera("diffuser"), wavelength=WAVELENGTH, tolerance=1e-9)
+    choice = tc.choose_model(camera("diffuser"), wavelength=WAVELENGTH, tolerance=1e-9)
     assert not choice.meets_tolerance
     assert [p.method.oversampling for p in choice.considered] == [1, 3, 5, 7]
     assert choice.predicted_error == choice.considered[-1].predicted_error
     lenses = camera("lenses")
     with pytest.raises(TypeError, match="the choice of a model needs known numbers"):
-        jax.jit(lambda w: tc.select_model(lenses, wavelength=w, tolerance=0.1).cost.flops)(
+        jax.jit(lambda w: tc.choose_model(lenses, wavelength=w, tolerance=0.1).cost.flops)(
             jnp.asarray(WAVELENGTH)
         )

@@ -108,7 +108,7 @@ def choices(request):
             return true_error(case, cameras.expected(case), method)
 
         for tolerance in TOLERANCES:
-            choice = tc.select_model(case.camera, tolerance=tolerance, **case.conditions)
+            choice = tc.choose_model(case.camera, tolerance=tolerance, **case.conditions)
             found.append((tolerance, choice, functools.partial(error, choice.method)))
     return found
 
@@ -152,7 +152,7 @@ def camera_of(shape=(48, 80), pitch=5.5e-3, distance=6.5, beta=25.0, **mask):
 
 
 def select(camera, tolerance, object_distance=250.0, **arguments):
-    return tc.select_model(
+    return tc.choose_model(
         camera, wavelength=500e-6, object_distance=object_distance, tolerance=tolerance, **arguments
     )
 
@@ -299,10 +299,10 @@ def test_tolerance_out_of_range(tolerance):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("call", ["select_model", "predict_error"])
+@pytest.mark.parametrize("call", ["choose_model", "predict_error"])
 def test_traced_numbers_are_refused(call):
     """One line that says what to do."""
-    extra = {"tolerance": 0.1} if call == "select_model" else {"model": "separable"}
+    extra = {"tolerance": 0.1} if call == "choose_model" else {"model": "separable"}
 
     @jax.jit
     def inside(distance):

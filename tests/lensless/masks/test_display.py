@@ -125,12 +125,12 @@ def test_models_and_plans():
     camera = tc.LenslessCamera(
         on_display(tc.ModifiedUniformlyRedundantArray(5, 0.06), PITCH, FILL), SENSOR, DISTANCE
     )
-    choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=0.3)
+    choice = tc.choose_model(camera, wavelength=WAVELENGTH, tolerance=0.3)
     exact = tc.psf(camera, wavelength=WAVELENGTH)
     found = tc.psf(camera, wavelength=WAVELENGTH, model=choice.method)
     assert relative_l2(found, exact) <= choice.predicted_error <= 0.3
     scene = tc.Scene(tc.ImagePlane(np.eye(9, 12), 150.0, 20.0), WAVELENGTH)
-    plan = tc.plan(camera, scene, tolerance=1e-2)
+    plan = tc.plan_capture(camera, scene, tolerance=1e-2)
     seen, full = tc.capture(camera, scene, model=plan), tc.capture(camera, scene)
     assert relative_l2(seen, full) <= plan.predicted_error <= 1e-2
 

@@ -195,7 +195,7 @@ def test_models_are_selected(name):
     """The prediction is kept, and the models offered are those that can hold the mask."""
     camera = tc.LenslessCamera(families.masks()[name], SENSOR, DISTANCE)
     light = {"wavelength": WAVELENGTH, "object_distance": 40.0}
-    choice = tc.select_model(camera, **light, tolerance=1e-4)
+    choice = tc.choose_model(camera, **light, tolerance=1e-4)
     assert choice.meets_tolerance
     found = tc.psf(camera, **light, model=choice.method)
     exact = psf_of(camera.mask, 40.0)
@@ -212,5 +212,5 @@ def test_a_scene_is_planned():
     scene = tc.Scene(
         [tc.ImagePlane(image, 40.0, 4.0)], tc.Spectrum(jnp.asarray([WAVELENGTH]), jnp.ones(1))
     )
-    plan = tc.plan(camera, scene, tolerance=1e-3)
+    plan = tc.plan_capture(camera, scene, tolerance=1e-3)
     assert plan.method.model == "separable" and plan.predicted_error <= 1e-3

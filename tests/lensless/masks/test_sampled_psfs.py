@@ -65,7 +65,7 @@ def test_near_and_far(name):
     )
     far = np.abs(rows @ field @ columns.T * (PITCH / 5) ** 2 / (WAVELENGTH * distance)) ** 2
     camera = tc.LenslessCamera(mask_of(name), tc.Sensor(SHAPE, PITCH), distance)
-    choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=1e-3)
+    choice = tc.choose_model(camera, wavelength=WAVELENGTH, tolerance=1e-3)
     # Rings have a model of their own, which meets any tolerance.
     assert choice.meets_tolerance == (name == "rings")
     if name != "rings":

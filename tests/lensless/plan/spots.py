@@ -78,7 +78,7 @@ def errors(count: int, seed: int, kind: str) -> np.ndarray:
     random, found = np.random.default_rng(seed), []
     for _ in range(count):
         camera, scene, tolerance = random_case(random, kind)
-        plan = tc.plan(camera, scene, tolerance=tolerance)
+        plan = tc.plan_capture(camera, scene, tolerance=tolerance)
         own = plan.method.field_tolerance
         choice = 0 if own is None else 1 if own >= 1 else 2
         capture = np.asarray(tc.capture(camera, scene, model=plan), float)

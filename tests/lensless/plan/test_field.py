@@ -60,7 +60,7 @@ def errors(count: int, seed: int) -> np.ndarray:
     random, found = np.random.default_rng(seed), []
     for _ in range(count):
         camera, scene, tolerance = random_case(random)
-        plan = tc.plan(camera, scene, tolerance=tolerance)
+        plan = tc.plan_capture(camera, scene, tolerance=tolerance)
         own = plan.method.field_tolerance
         choice = 0 if own is None else 1 if own >= 1 else 2
         true = relative_l2(
@@ -97,7 +97,7 @@ def test_lenses_over_the_field():
     image = np.zeros((9, 31))
     image[4, 1] = 1.0
     scene = tc.Scene(tc.ImagePlane(image, 100.0, 31 * 60 * um / 3 * 100), 500 * nm)
-    plan = tc.plan(camera, scene, tolerance=0.05)
+    plan = tc.plan_capture(camera, scene, tolerance=0.05)
     assert plan.shares["field"] > 0.05 and not plan.meets_tolerance
     assert not any(effect.name == "shift-variance" for effect in plan.effects)
 
@@ -120,7 +120,7 @@ def test_a_wide_field_has_the_light_of_every_point():
     camera, scene = wide(1, 1)
     exact = captured(camera, scene, dataclasses.replace(EXACT, nodes=21))
     assert relative_l2(np.asarray(tc.capture(camera, scene)), exact) > 0.05
-    plan = tc.plan(camera, scene, tolerance=0.03)
+    plan = tc.plan_capture(camera, scene, tolerance=0.03)
     assert plan.method.field_tolerance == 1
     assert "the PSF of the axis, the light of every point" in str(plan)
     true = relative_l2(np.asarray(tc.capture(camera, scene, model=plan)), exact)
@@ -133,7 +133,7 @@ def test_planes_and_colours_over_the_field():
     camera, scene = wide(3, 3)
     method = tc.PsfMethod("separable", nodes=89, field_tolerance=1e-3)
     exact = np.asarray(tc.capture(camera, scene, model=method))
-    plan = tc.plan(camera, scene, tolerance=3e-3)
+    plan = tc.plan_capture(camera, scene, tolerance=3e-3)
     assert plan.method.field_tolerance is not None and plan.method.field_tolerance < 1
     assert "every point with its own PSF, within" in str(plan)
     true = relative_l2(np.asarray(tc.capture(camera, scene, model=plan)), exact)

@@ -30,7 +30,7 @@ PROCESS = """
         for t in np.geomspace(100.0, 1000.0, int(planes))
     ]
     scene = tc.Scene(found, [500e-6, 600e-6])
-    plan = tc.plan(camera, scene, tolerance=tolerance)
+    plan = tc.plan_capture(camera, scene, tolerance=tolerance)
     jax.block_until_ready(tc.capture(camera, scene, model=plan))
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")

@@ -38,7 +38,7 @@ def deep(request):
 )
 def test_error_is_within_the_tolerance_with_few_psfs(deep, tolerance, most_psfs):
     whole, full = deep
-    plan = tc.plan(camera(), whole, tolerance=tolerance, over_field=False)
+    plan = tc.plan_capture(camera(), whole, tolerance=tolerance, over_field=False)
     assert plan.meets_tolerance
     planned = tc.capture(camera(), whole, model=plan)
     true = relative_l2(planned, full)
@@ -50,7 +50,7 @@ def test_error_is_within_the_tolerance_with_few_psfs(deep, tolerance, most_psfs)
 @pytest.mark.thorough
 def test_a_coarse_tolerance_takes_a_cheaper_model(deep):
     whole, _ = deep
-    plan = tc.plan(camera(), whole, tolerance=0.3)
+    plan = tc.plan_capture(camera(), whole, tolerance=0.3)
     assert plan.method.model != "separable"
     assert plan.method.precision == "float32"
     assert not plan.method.pixel_integration
@@ -60,13 +60,13 @@ def test_a_coarse_tolerance_takes_a_cheaper_model(deep):
 def test_double_precision_where_single_cannot_serve():
     """At 1e-8 everything is computed, in float64 though the camera is in float32."""
     own, few = camera(np.float32), scene(2, 2, dtype=np.float32)
-    plan = tc.plan(own, few, tolerance=1e-7, over_field=False)
+    plan = tc.plan_capture(own, few, tolerance=1e-7, over_field=False)
     assert (plan.method.model, plan.method.precision) == ("separable", "float64")
     planned = tc.capture(own, few, model=plan)
     assert planned.dtype == jnp.float32
     double = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (own, few))
     assert relative_l2(planned, tc.capture(*double)) < 1e-7
-    assert not tc.plan(
+    assert not tc.plan_capture(
         own, few, tolerance=1e-9, over_field=False
     ).meets_tolerance  # the result is float32
 
@@ -76,7 +76,7 @@ def test_equal_planes_merge_into_one():
     one = scene(1, 1).planes[0]
     other = tc.ImagePlane(one.image[::-1], one.distance, one.width)
     both = tc.Scene([one, other], 500 * nm)
-    plan = tc.plan(camera(), both, tolerance=1e-4, over_field=False)
+    plan = tc.plan_capture(camera(), both, tolerance=1e-4, over_field=False)
     assert len(plan.distances) == 1
     np.testing.assert_allclose(plan.mixing, [[1.0, 1.0]], atol=1e-10)
     full = tc.capture(camera(), both)
@@ -85,14 +85,14 @@ def test_equal_planes_merge_into_one():
 
 def test_a_batch_is_planned_as_one():
     colours = scene(4, 3, batch=(3,))
-    plan = tc.plan(camera(), colours, tolerance=1e-2, over_field=False)
+    plan = tc.plan_capture(camera(), colours, tolerance=1e-2, over_field=False)
     planned = tc.capture(camera(), colours, model=plan)
     assert relative_l2(planned, tc.capture(camera(), colours)) <= plan.predicted_error
 
 
 @pytest.mark.thorough
 def test_table_names_every_decision(deep):
-    plan = tc.plan(camera(), deep[0], tolerance=1e-2)
+    plan = tc.plan_capture(camera(), deep[0], tolerance=1e-2)
     table = str(plan)
     for words in (
         "tolerance     1.0e-02, predicted",
@@ -111,7 +111,7 @@ def test_table_names_every_decision(deep):
 
 def test_effects_have_the_sizes_of_the_physics():
     """cos⁴θ over fields of 0.15 rad, and 1/√(0.9·13500) of shot noise."""
-    plan = tc.plan(camera(), scene(16, 11), tolerance=0.1, over_field=False)
+    plan = tc.plan_capture(camera(), scene(16, 11), tolerance=0.1, over_field=False)
     sizes = {effect.name: effect.size for effect in plan.effects}
     y, x = np.meshgrid(np.linspace(-0.5, 0.5, 401) * 0.1125, np.linspace(-0.5, 0.5, 401) * 0.15)
     fall = 1 - (1 + y**2 + x**2) ** -2
@@ -141,7 +141,7 @@ def test_change_of_the_psf_over_the_field(width, angle):
 def test_gradients_pass_through_a_planned_capture():
     """With respect to the images and β; in double precision, for differences' sake."""
     few = scene(3, 2)
-    plan = tc.plan(camera(), few, tolerance=1e-3, over_field=False)
+    plan = tc.plan_capture(camera(), few, tolerance=1e-3, over_field=False)
     double = dataclasses.replace(plan.method, precision="float64")
     plan = dataclasses.replace(plan, method=double)
     weights = jnp.asarray(np.random.default_rng(5).normal(size=(80, 96)))
@@ -167,7 +167,7 @@ def test_gradients_pass_through_a_planned_capture():
 @pytest.mark.thorough
 def test_noise_is_added_to_a_planned_capture(key):
     few = scene(1, 1)
-    plan = tc.plan(camera(), few, tolerance=1e-2)
+    plan = tc.plan_capture(camera(), few, tolerance=1e-2)
     noise = tc.PoissonGaussianNoise()
     noisy = tc.capture(camera(), few, model=plan, noise=noise, key=key)
     clean = tc.capture(camera(), few, model=plan)
@@ -176,7 +176,7 @@ def test_noise_is_added_to_a_planned_capture(key):
 
 @pytest.mark.thorough
 def test_a_plan_is_not_run_on_another_scene():
-    plan = tc.plan(camera(), scene(2, 2), tolerance=0.1)
+    plan = tc.plan_capture(camera(), scene(2, 2), tolerance=0.1)
     with pytest.raises(ValueError, match=r"for 2 planes at given distances.*make a plan"):
         tc.capture(camera(), scene(3, 2), model=plan)
     with pytest.raises(ValueError, match=r"for 2 given wavelengths.*make a plan"):
@@ -192,26 +192,26 @@ def test_a_plan_is_not_run_on_another_scene():
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, 5.0, float("nan"), float("inf")])
 def test_bad_tolerances(tolerance):
     with pytest.raises(ValueError, match="tolerance"):
-        tc.plan(camera(), scene(1, 1), tolerance=tolerance)
+        tc.plan_capture(camera(), scene(1, 1), tolerance=tolerance)
 
 
 def test_what_cannot_be_planned():
     own = camera()
 
     def inside(distance):
-        plan = tc.plan(
+        plan = tc.plan_capture(
             tc.LenslessCamera(own.mask, own.sensor, distance), scene(1, 1), tolerance=1.0
         )
         return jnp.asarray(plan.predicted_error)
 
-    with pytest.raises(TypeError, match="plan needs known numbers"):
+    with pytest.raises(TypeError, match="plan_capture needs known numbers"):
         jax.jit(inside)(6.5)
 
 
 @pytest.mark.thorough
 def test_a_dark_scene_has_a_plan():
     dark = tc.Scene(tc.ImagePlane(np.zeros((4, 6)), 200.0, 20.0), 500 * nm)
-    plan = tc.plan(camera(), dark, tolerance=1e-2)
+    plan = tc.plan_capture(camera(), dark, tolerance=1e-2)
     assert (np.asarray(tc.capture(camera(), dark, model=plan)) == 0).all()
 
 
@@ -272,7 +272,7 @@ ODD = {
 @pytest.mark.parametrize("tolerance", [0.1, 1e-2, 1e-3])
 def test_odd_scenes_stay_within_their_prediction(name, tolerance):
     own, odd = ODD[name]
-    plan = tc.plan(own, odd, tolerance=tolerance, over_field=False)
+    plan = tc.plan_capture(own, odd, tolerance=tolerance, over_field=False)
     true = relative_l2(tc.capture(own, odd, model=plan), tc.capture(own, odd))
     assert true <= plan.predicted_error <= tolerance
 
@@ -282,14 +282,14 @@ def test_phases_that_float32_does_not_hold_are_planned_in_float64():
     mask = tc.FresnelZoneAperture(1e3, width=100.0)
     own = tc.LenslessCamera(mask, tc.Sensor((64, 72), 1.0), 0.65)
     one = tc.Scene(flat([500.0], 0.3), 500 * nm)
-    plan = tc.plan(own, one, tolerance=0.3)
+    plan = tc.plan_capture(own, one, tolerance=0.3)
     assert plan.method.precision == "float64"
     assert np.isfinite(np.asarray(tc.capture(own, one, model=plan))).all()
 
 
 def test_a_plan_notices_other_light_and_larger_planes():
     few = scene(2, 3)
-    plan = tc.plan(camera(), few, tolerance=0.1)
+    plan = tc.plan_capture(camera(), few, tolerance=0.1)
     brighter = tc.Scene(few.planes, tc.Spectrum(few.spectrum.wavelengths, [0.2, 0.2, 0.2]))
     with pytest.raises(ValueError, match=r"for 3 given weights.*make a plan"):
         tc.capture(camera(), brighter, model=plan)
@@ -297,14 +297,14 @@ def test_a_plan_notices_other_light_and_larger_planes():
     with pytest.raises(ValueError, match=r"cover \(\d+, \d+\) samples.*make a plan"):
         tc.capture(camera(), tc.Scene(wider, few.spectrum), model=plan)
     with pytest.raises(TypeError, match=r"scene is ImagePlane\(.*; give Scene\(planes, spectrum\)"):
-        tc.plan(camera(), few.planes[0], tolerance=0.1)
+        tc.plan_capture(camera(), few.planes[0], tolerance=0.1)
 
 
 @pytest.mark.thorough
 def test_another_phase_may_use_the_plan():
     """The exposures of fringe scanning share one."""
     few = scene(2, 2)
-    plan = tc.plan(camera(), few, tolerance=1e-2)
+    plan = tc.plan_capture(camera(), few, tolerance=1e-2)
     mask = tc.FresnelZoneAperture(25.0, 2.0, width=3.6, centre=(0.1, -0.2))
     other = tc.LenslessCamera(mask, camera().sensor, 6.5)
     full = tc.capture(other, few)

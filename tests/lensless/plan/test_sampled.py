@@ -65,7 +65,7 @@ def reference(here, scene, samples):
 def test_predicted_error_is_at_least_the_true_one(optimised, name, samples):
     here, scene = camera(name), deep()
     true = reference(here, scene, samples)
-    plan = tc.plan(here, scene, tolerance=0.05)
+    plan = tc.plan_capture(here, scene, tolerance=0.05)
     found = relative_l2(tc.capture(here, scene, model=plan), true)
     expected = "radial" if name == "rings" else "angular_spectrum"
     assert plan.method.model == expected and plan.meets_tolerance
@@ -81,7 +81,7 @@ def test_a_plan_runs_inside_jit():
     here = tc.LenslessCamera(mask, tc.Sensor((12, 14), 10 * um), 2.0)
     image = np.random.default_rng(2).uniform(0, 1, (9, 11))
     scene = tc.Scene([tc.ImagePlane(image, t, 0.05 * t) for t in (50.0, 52.0)], 532 * nm)
-    plan = tc.plan(here, scene, tolerance=0.3)
+    plan = tc.plan_capture(here, scene, tolerance=0.3)
     assert (
         plan.method.model == "angular_spectrum"
         and plan.meets_tolerance

@@ -137,7 +137,7 @@ def test_choice_meets_the_tolerance():
     camera = camera_of(shape=(56, 45), pitch=5.5 * um)
     exact = psf(camera)
     light: dict[str, Any] = {"wavelength": WAVELENGTH, "object_distance": 250.0}
-    choice = tc.select_model(camera, tolerance=1e-4, **light)
+    choice = tc.choose_model(camera, tolerance=1e-4, **light)
     assert (choice.method.model, choice.meets_tolerance) == ("radial", True)
     assert "24 rings" in choice.reasons[0]
     assert relative_l2(psf(camera, model=choice.method), exact) <= choice.predicted_error < 1e-4
@@ -154,7 +154,7 @@ def test_choice_among_points_of_a_pixel():
     method = tc.PsfMethod("radial", "float64", True, nodes=987)
     exact = psf(camera, model=method)
     for tolerance in (2e-2, 5e-3):
-        choice = tc.select_model(camera, tolerance=tolerance, pixel_integration=True, **light)
+        choice = tc.choose_model(camera, tolerance=tolerance, pixel_integration=True, **light)
         off = relative_l2(psf(camera, model=choice.method), exact)
         assert off <= choice.predicted_error <= tolerance
 

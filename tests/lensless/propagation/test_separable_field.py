@@ -127,7 +127,7 @@ def test_predicted_error_is_above_the_true_one(average):
     camera = camera_of(tc.SampledMask(RANDOM.integers(0, 2, (131, 140)), 10 * um))
     how: dict[str, Any] = {"wavelength": 500 * nm, "object_distance": 40.0}
     how["pixel_integration"] = average
-    chosen = tc.select_model(camera, tolerance=0.01, **how)
+    chosen = tc.choose_model(camera, tolerance=0.01, **how)
     assert chosen.meets_tolerance and chosen.method.model == "separable"
     exact = tc.psf(camera, model=tc.PsfMethod("separable", nodes=610 if average else None), **how)
     error = relative_l2(tc.psf(camera, model=chosen.method, **how), exact)

@@ -172,8 +172,8 @@ def known_drivers(connected: bool = False, asked: str | None = None) -> list[str
 def build_plan(config: "CaptureConfig") -> "Plan":
     """The plan of a file, with its settings."""
     from thincam_jax.commands.capture.run import picture_levels
-    from thincam_jax.hardware.acquisition.plan import levels_pattern
     from thincam_jax.hardware.base import CameraSettings
+    from thincam_jax.hardware.plans import levels_pattern
 
     settings, shown = config.camera.build(CameraSettings), picture_levels(config)
     given = {"stage_zero": 0.0 if config.optics is None else config.optics.distance, "shown": shown}

@@ -64,7 +64,7 @@ class Rig:
 
     def __init__(self, sources: Sources):
         self.sources, self.warned = sources, set[str]()
-        self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
+        self.dead = None if sources.dead is None else measured.read_pixel_map(sources.dead)
         self._dark = functools.lru_cache(8)(measured.read_image)
         psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
         given, of_psf = sources.psf, sources.psf_background

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
-from thincam_jax.hardware.acquisition import plan as plans
+from thincam_jax.hardware import plans
+from thincam_jax.hardware.acquisition.plan import WHITE, Pattern, Plan
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.lensless.masks.fza import PROFILES, Profile
 from thincam_jax.measured.calibration.alignment import MapKind
@@ -173,8 +174,8 @@ class PlanRequest:
         *,
         stage_zero: float = 0.0,
         shown: Mapping[str, np.ndarray] | None = None,
-        mask: plans.Pattern = plans.WHITE,
-    ) -> plans.Plan:
+        mask: Pattern = WHITE,
+    ) -> Plan:
         """The steps.
 
         - `stage_zero`: distance at the stage's position 0, mm.

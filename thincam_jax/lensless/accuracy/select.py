@@ -56,7 +56,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Selection(Prediction):
-    """The choice of `select_model`.
+    """The choice of `choose_model`.
 
     - `meets_tolerance`: False if no model does; the choice is then the most accurate.
     - `paraxial_error`: estimate of how far exact scalar diffraction is from the Fresnel field that
@@ -70,11 +70,11 @@ class Selection(Prediction):
 
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    choice = tc.select_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
+    choice = tc.choose_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
     print(choice.meets_tolerance)  # True
     ```
 
-    **See also**: `select_model`.
+    **See also**: `choose_model`.
     """
 
     meets_tolerance: bool
@@ -84,7 +84,7 @@ class Selection(Prediction):
 
 
 @checked
-def select_model(
+def choose_model(
     camera: LenslessCamera,
     *,
     wavelength: Number,
@@ -121,11 +121,11 @@ def select_model(
 
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    choice = tc.select_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
+    choice = tc.choose_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
     h = tc.psf(camera, wavelength=500 * nm, object_distance=250.0, model=choice.method)
     ```
 
-    **See also**: `predict_error`, `plan`, `psf`.
+    **See also**: `predict_error`, `plan_capture`, `psf`.
     """
     tolerance = tolerance_of(tolerance)
     if isinstance(camera, LenslessCamera) and not has_few_terms(camera.mask):
@@ -165,12 +165,12 @@ def predict_error(
     pixel_integration: bool = False,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments as for `psf`, reference as for
-    `select_model`.
+    `choose_model`.
 
     `at` is for "separable" and "geometric", against the exact field to second order about the ray.
     Off both axes the waves of a plate's corners count, which it leaves out (`corner_error`).
 
-    **Errors**: as `select_model`; ValueError for samples off the axis, by which "separable" has
+    **Errors**: as `choose_model`; ValueError for samples off the axis, by which "separable" has
     cells off both axes.
 
     ```python
@@ -183,7 +183,7 @@ def predict_error(
     print(found.predicted_error > 0.01)  # True
     ```
 
-    **See also**: `select_model`.
+    **See also**: `choose_model`.
     """
     average = as_method(model, pixel_integration).pixel_integration
     probe = probe_of(camera, wavelength, object_distance, average, at)
@@ -304,7 +304,7 @@ def probe_of(
     at: Position | None = None,
 ) -> MaskProbe:
     """The probe of a camera whose numbers are known, off both axes with products of both."""
-    mask = require_camera(camera, "select_model")
+    mask = require_camera(camera, "choose_model")
     path = replace(camera.path(wavelength, object_distance, at), skew=False)
     grid = camera.sensor.grid
     _require_known((camera, path, grid))

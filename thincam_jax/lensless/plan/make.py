@@ -25,7 +25,7 @@ _MODEL_SHARE, _FIELD_SHARE, _WAVELENGTH_SHARE = 0.3, 0.3, 0.6
 
 
 @checked
-def plan(
+def plan_capture(
     camera: LenslessCamera, scene: Scene, *, tolerance: float, over_field: bool = True
 ) -> Plan:
     r"""Plan the capture of a scene to a relative error at the least cost.
@@ -58,15 +58,15 @@ def plan(
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
     planes = [tc.ImagePlane([[0.0, 1.0]], d, width=0.2 * d) for d in (200.0, 210.0)]
-    plan = tc.plan(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
+    plan = tc.plan_capture(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
     print(plan.predicted_error < 0.05)  # True
     ```
 
-    **See also**: `select_model`, `capture`.
+    **See also**: `choose_model`, `capture`.
     """
     tolerance = tolerance_of(tolerance)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
-        raise TypeError("plan needs known numbers: call it outside of jit and grad")
+        raise TypeError("plan_capture needs known numbers: call it outside of jit and grad")
     seen = SeenScene(camera, scene, tolerance)
     method, model_error = choose_psf(seen, tolerance * _MODEL_SHARE)
     model_error += RESULT_ROUNDING[precision_of(camera.sensor.pitch)]

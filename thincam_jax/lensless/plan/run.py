@@ -53,11 +53,11 @@ class Plan:
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
     planes = [tc.ImagePlane([[0.0, 1.0]], d, width=0.2 * d) for d in (200.0, 210.0)]
-    plan = tc.plan(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
+    plan = tc.plan_capture(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
     print(len(plan.distances))  # 1
     ```
 
-    **See also**: `plan`.
+    **See also**: `plan_capture`.
     """
 
     camera: LenslessCamera

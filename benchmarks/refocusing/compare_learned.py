@@ -1,7 +1,7 @@
 """What the distance in the optics is worth: networks trained alike, with it and without.
 
-`python docs/compare_learned.py IMAGES TUNING [COUNT] [STEPS] [POOL] [SEEDS]`, as
-docs/score_refocusing.py, for a camera of a quarter of the pixels. Networks and codes are trained
+`python compare_learned.py IMAGES TUNING [COUNT] [STEPS] [POOL] [SEEDS]`, as
+score_refocusing.py, for a camera of a quarter of the pixels. Networks and codes are trained
 on the same scenes, of TUNING, scikit-image's photographs and drawn ones, for the same CPU time
 (without compiling; the network's with drawing them), with so many seeds of scenes, weights and
 noise:

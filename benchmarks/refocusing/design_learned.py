@@ -1,6 +1,6 @@
 """β and d found through the training of a refocusing network, against those for a Wiener filter.
 
-`python docs/design_learned.py [STEPS]`: at 32×32 pixels, drawn scenes with depth, 30 dB. Two
+`python design_learned.py [STEPS]`: at 32×32 pixels, drawn scenes with depth, 30 dB. Two
 designs by gradient from the same start: with the weights of the network, and for the image of a
 Wiener filter whose strength is learnt. Then a network is trained anew for each camera, and judged
 on the same unseen scenes; prints a Markdown table.

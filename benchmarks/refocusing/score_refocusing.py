@@ -1,6 +1,6 @@
 """A refocusing network (docs/guide/refocusing.md) against what it has to beat, in one table.
 
-`python docs/score_refocusing.py NETWORK IMAGES TUNING [COUNT]`: a network of `refocus_camera`, such
+`python score_refocusing.py NETWORK IMAGES TUNING [COUNT]`: a network of `refocus_camera`, such
 as "shipped"; a folder of photographs that no weight has seen, and one of the training's, on which
 the strengths of the baselines are tuned; how many scenes of each kind. Prints Markdown tables: PSNR
 in dB with the half width of its 95 % interval over the photographs, SSIM, MS-SSIM; in the first
@@ -390,7 +390,7 @@ def picture(methods: Methods) -> None:
             if name != "lens":
                 ax.set_xlabel(f"{scores(image, target)['psnr']:.1f} dB", fontsize=9)
         axes[0].set_ylabel(f"focused on {distance:g} mm", fontsize=9)
-    figure.savefig(Path(__file__).parent / "images/learned_measured.png", dpi=80)
+    figure.savefig(Path(__file__).parents[2] / "docs/images/learned_measured.png", dpi=80)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import squared_modulus
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import cut, kernel_grid, place
@@ -29,7 +28,6 @@ from thincam_jax.studies.study import Synthesis, synthesis_matrix
 _TOLERANCE, _STEPS = 1e-3, 400
 
 
-@checked
 @dataclass(frozen=True, eq=False)
 class ComparedMask:
     """One mask, or the several that a camera takes one after the other.
@@ -38,20 +36,11 @@ class ComparedMask:
     - `synthesis`: sums that are made of the captures; "fringe_scanning" takes the phases 0, π/2, π,
       3π/2.
     - `sort`: sort of mask; plots draw each by a dash and a grey of its own.
-
-    **Errors**: ValueError for a number of masks that the synthesis does not take.
     """
 
     masks: tuple[AbstractMask, ...]
     sort: str = "mask"
     synthesis: Synthesis = "separate"
-
-    def __post_init__(self):
-        if self.weights.shape[1] != len(self.masks):
-            raise ValueError(
-                f"masks: {len(self.masks)} are given; synthesis {self.synthesis} takes "
-                f"{self.weights.shape[1]}"
-            )
 
     @property
     def weights(self) -> np.ndarray:
@@ -59,7 +48,6 @@ class ComparedMask:
         return synthesis_matrix(self.synthesis, 1, 1)
 
 
-@checked
 @dataclass(frozen=True, eq=False)
 class Setting:
     """Setting that all masks share.

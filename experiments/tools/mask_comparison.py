@@ -4,20 +4,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-
-from thincam_jax._core.arguments import checked
-from thincam_jax._core.steps import Progress, Step, carry_out
-from thincam_jax._core.table import Table, number
-from thincam_jax.imaging.metrics import psnr, ssim
-from thincam_jax.imaging.targets import resize
-from thincam_jax.reconstruction.wiener import Prior
-from thincam_jax.studies.mask_captures import (
+from mask_captures import (
     ComparedMask,
     Setting,
     Strength,
@@ -28,15 +21,19 @@ from thincam_jax.studies.mask_captures import (
     strength,
     total_variation,
 )
+from matplotlib.figure import Figure
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table, number
+from thincam_jax.imaging.metrics import align, psnr, ssim
+from thincam_jax.imaging.targets import resize
+from thincam_jax.plot.frame import drawing, new_figure
+from thincam_jax.reconstruction.wiener import Prior
 
 Colours = Literal["one wavelength", "broadband"]
 Estimate = Literal["total variation", "linear", "focused far"]
 
 
-@checked
 @dataclass(frozen=True, eq=False)
 class ComparedScene:
     """A scene on the field's pixels (y, x), 0 to 1, as it is cast on the sensor.
@@ -70,7 +67,6 @@ class ComparedScene:
         return slope, slope * (2 * math.pi / max(self.image.shape)) ** 2
 
 
-@checked
 @dataclass(frozen=True, eq=False)
 class Tuning:
     """τ of total variation, for each mask and light: the best of `tau` on a scene of its own."""
@@ -100,33 +96,6 @@ class MaskComparison:
     - `wavelength`, and a `band` of several of equal weight, mm.
     - `light`: electrons a pixel of the bare sensor before a white scene, the weakest first.
     - `object_distances`: mm; the first is that of all comparisons but the one of distances.
-
-    ```python
-    import thincam_jax as tc
-    from thincam_jax.imaging.targets import sample_image
-    from thincam_jax.imaging.targets.patterns import point_grid
-    from thincam_jax.studies.mask_captures import ComparedMask, Setting
-    from thincam_jax.studies.mask_comparison import ComparedScene, MaskComparison, Tuning
-    from thincam_jax.units import nm, um
-
-    field = (24, 28)
-    comparison = MaskComparison(
-        Setting(tc.Sensor((48, 56), 24 * um), distance=2.0, field=field, width=0.744),
-        masks={
-            "pinhole": ComparedMask((tc.Pinhole(48 * um),)),
-            "MURA": ComparedMask((tc.ModifiedUniformlyRedundantArray(31, 24 * um),)),
-        },
-        scenes={"points": ComparedScene.of_picture(point_grid((28, 28), (9, 9)), field, "flat")},
-        tuning=Tuning(ComparedScene.of_picture(sample_image("astronaut"), field), (1.0, 4.0), 20),
-        wavelength=550 * nm,
-        band=(500 * nm, 600 * nm),
-        light=(1e3, 1e5),
-        object_distances=(300.0, 20.0),
-    )
-    print(comparison.run().table())
-    ```
-
-    **Errors**: ValueError for lights that do not rise, and a scene of another size than the field.
     """
 
     setting: Setting
@@ -139,19 +108,9 @@ class MaskComparison:
     object_distances: tuple[float, float]
     seed: int = 0
 
-    def __post_init__(self):
-        if list(self.light) != sorted(set(self.light)):
-            raise ValueError(f"light: {list(self.light)} do not rise; give the weakest first")
-        for name, scene in {**self.scenes, "of the tuning": self.tuning.scene}.items():
-            if scene.image.shape != self.setting.field:
-                raise ValueError(
-                    f"scene {name}: has {scene.image.shape} pixels; give those of the field, "
-                    f"{self.setting.field}"
-                )
-
-    def run(self, progress: Progress | None = None) -> "MaskComparisonResult":
+    def run(self, progress: Progress | None = None) -> "Result":
         """All masks on all scenes; all but the times of PSFs is the same at every run."""
-        result = MaskComparisonResult(self)
+        result = Result(self)
         work: list[Step] = []
         for name in self.masks:
             work.append(Step(f"{name}: tau", partial(self._tune, result, name)))
@@ -170,7 +129,7 @@ class MaskComparison:
             key = jax.random.fold_in(key, given)
         return key
 
-    def _tune(self, result: "MaskComparisonResult", name: str) -> None:
+    def _tune(self, result: "Result", name: str) -> None:
         """τ at each light, far away and in one wavelength, and what the PSF says by itself."""
         setting, compared, far = self.setting, self.masks[name], self.object_distances[0]
         psfs = kernels(setting, compared, (self.wavelength,), far)
@@ -189,9 +148,7 @@ class MaskComparison:
         result.psfs[name] = psfs
         result.strengths[name] = strength(setting, compared, psfs, self.wavelength, far)
 
-    def _reconstruct(
-        self, result: "MaskComparisonResult", name: str, distance: float, colours: Colours
-    ) -> None:
+    def _reconstruct(self, result: "Result", name: str, distance: float, colours: Colours) -> None:
         """All scenes at every light, by both estimates."""
         setting, compared, far_psfs = self.setting, self.masks[name], result.psfs[name]
         near, alone = distance == self.object_distances[1], colours == "one wavelength"
@@ -226,7 +183,7 @@ def _stack(scenes: Sequence[ComparedScene]) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class MaskComparisonResult:
+class Result:
     """Result of a comparison.
 
     - `scores`: PSNR in dB, and SSIM, of each case; `images`: its reconstruction (y, x).
@@ -320,16 +277,88 @@ class MaskComparisonResult:
         headings = ("mask", "broadband", f"{near}, its PSF known", f"{near}, PSF of the first")
         return Table(headings, rows, (1, 1, 1), title="costs in dB")
 
-    def plot_error(self) -> "Figure":
-        """Root mean square error against light, a line for each mask, a panel for each scene."""
-        from thincam_jax.plot.frame import new_figure
-        from thincam_jax.plot.mask_comparison import draw_error
 
-        return draw_error(self, new_figure(11.0, 4.4))
+# Dash and grey tell the sort of a mask, and the marker which it is: read without colours.
+_SORTS = (
+    ("-", "#000000"),
+    ("--", "#404040"),
+    (":", "#606060"),
+    ("-.", "#808080"),
+    ("-", "#b0b0b0"),
+)
+_MARKERS = "osD^v<>*XPphd"
 
-    def plot_images(self) -> "Figure":
-        """A row for each mask: the mask, its PSF, and scenes at several lights and distances."""
-        from thincam_jax.plot.frame import new_figure
-        from thincam_jax.plot.mask_comparison import draw_images
 
-        return draw_images(self, new_figure(1.0, 1.0))
+def draw_error(result: Result) -> Figure:
+    """Root mean square error against light, a line for each mask and a panel for each scene."""
+    figure = new_figure(11.0, 4.4)
+    comparison = result.comparison
+    panels = figure.subplots(1, len(comparison.scenes), squeeze=False)[0]
+    light = comparison.light
+    sorts = list(dict.fromkeys(one.sort for one in comparison.masks.values()))
+    for ax, scene in zip(panels, comparison.scenes, strict=True):
+        for place, (name, mask) in enumerate(comparison.masks.items()):
+            dash, grey = _SORTS[sorts.index(mask.sort) % len(_SORTS)]
+            scores = (result.scores[result.case(name, scene, at)][0] for at in light)
+            ax.loglog(
+                light,
+                [10 ** (-score / 20) for score in scores],
+                label=name,
+                color=grey,
+                linestyle=dash,
+                marker=_MARKERS[place % len(_MARKERS)],
+                markersize=5,
+                linewidth=1.2,
+                markerfacecolor="white" if len(mask.masks) > 1 else grey,
+            )
+        ax.set_title(scene, fontsize=10)
+        ax.set_xlabel("electrons a pixel of the bare sensor")
+        ax.grid(alpha=0.3, which="both")
+    panels[0].set_ylabel("root mean square error (white = 1)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    # The worst first, as the lines are at the left.
+    order = np.argsort([result.mean(name) for name in labels])
+    figure.legend(
+        [handles[n] for n in order],
+        [labels[n] for n in order],
+        loc="outside right upper",
+        fontsize=8,
+    )
+    return figure
+
+
+def draw_images(result: Result) -> Figure:
+    """A row for each mask: the mask, its PSF, and scenes at several lights, colours, distances."""
+    comparison, setting = result.comparison, result.comparison.setting
+    first, *_ = comparison.scenes
+    *weaker, strong = comparison.light
+    asked = {f"{first}\n{at:,.0f}": (first, at, {}) for at in weaker}
+    asked |= {f"{scene}\n{strong:,.0f}": (scene, strong, {}) for scene in comparison.scenes}
+    near = f"at {comparison.object_distances[1]:g} mm"
+    asked[f"{first}\n{strong:,.0f}, broadband"] = first, strong, {"colours": "broadband"}
+    asked[f"{first}\n{strong:,.0f}, {near}"] = first, strong, {"near": True}
+    columns, rows = 2 + len(asked), len(comparison.masks)
+    size = 1.5 * columns, 1.62 * rows + 0.5
+    figure, axes = drawing(size, rows, columns, squeeze=False)
+    grid = setting.sensor.grid
+    for row, (name, compared) in zip(axes, comparison.masks.items(), strict=True):
+        mask, h = compared.masks[0], np.asarray(result.psfs[name][0])
+        t = np.asarray(mask.sample(grid, comparison.wavelength))
+        shown = np.where(np.abs(t) > 0.5, np.angle(t), -np.pi) if mask.pure_phase else np.abs(t)
+        row[0].imshow(shown, cmap="gray")
+        down, right = ((a - b) // 2 for a, b in zip(h.shape, grid.shape, strict=True))
+        seen = h[down : down + grid.shape[0], right : right + grid.shape[1]]
+        row[1].imshow(seen, cmap="gray", vmin=0, vmax=np.quantile(seen, 0.998))
+        row[0].set_ylabel(name, fontsize=8)
+        for ax, (scene, electrons, other) in zip(row[2:], asked.values(), strict=True):
+            case, truth = (
+                result.case(name, scene, electrons, **other),
+                comparison.scenes[scene].image,
+            )
+            ax.imshow(align(result.images[case], truth)[0], cmap="gray", vmin=0, vmax=truth.max())
+            ax.set_xlabel(f"{result.scores[case][0]:.1f} dB", fontsize=8, labelpad=1)
+    for ax, title in zip(axes[0], ("mask", "PSF", *asked), strict=True):
+        ax.set_title(title, fontsize=8)
+    for ax in axes.ravel():
+        ax.set(xticks=[], yticks=[])
+    return figure

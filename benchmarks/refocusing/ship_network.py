@@ -1,7 +1,7 @@
 """A trained network as it comes with the package: its weights in half precision.
 
-`python docs/ship_network.py NETWORK`: a denoiser, or a refocusing network of the camera of
-docs/score_refocusing.py.
+`python ship_network.py NETWORK`: a denoiser, or a refocusing network of the camera of
+score_refocusing.py.
 """
 
 import sys
@@ -18,7 +18,7 @@ from thincam_jax.learn.denoiser.network import load_network, network_description
 from thincam_jax.learn.refocusing import store
 from thincam_jax.learn.refocusing.store import save
 
-ROOM = Path(__file__).parents[1] / "thincam_jax/learn"
+ROOM = Path(__file__).parents[2] / "thincam_jax/learn"
 
 
 def halved(weights):

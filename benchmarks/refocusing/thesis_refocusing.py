@@ -1,6 +1,6 @@
 """The thesis' test of refocusing (section 4.2), by its camera and by the one of the network here.
 
-`python docs/thesis_refocusing.py IMAGES TUNING [COUNT]`, as docs/score_refocusing.py. Two
+`python thesis_refocusing.py IMAGES TUNING [COUNT]`, as score_refocusing.py. Two
 planes, the near one left and the far one right, focused on one and on the other: PSNR of the whole
 frame (table 4.2), and of the half in focus, told its distance and told the other's. If that loses
 nothing, the planes are not told apart. Draws docs/images/learned_thesis.png.
@@ -139,7 +139,7 @@ def picture(shown: dict[str, tuple]) -> None:
             ax.set(xticks=[], yticks=[])
             ax.set_title(title, fontsize=10)
         line[0].set_ylabel(name)
-    figure.savefig(Path(__file__).parent / "images/learned_thesis.png", dpi=80)
+    figure.savefig(Path(__file__).parents[2] / "docs/images/learned_thesis.png", dpi=80)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,243 @@
+"""What people hand over, a row each: the default is within 1 dB of what was possible, or says why.
+
+Each row makes its files, gives them to `thincam reconstruct` as a newcomer would, and again with
+what the lab knows. Rows that are not as good name the option or the fault that decides.
+"""
+
+import json
+import warnings
+
+import numpy as np
+import PIL.Image
+import pytest
+import tifffile
+from measured.test_containers import WRITERS, packed
+from measured.test_examination import cells, counts, diffuser, quality, scene, seen, spots, zones
+from measured.test_facts import dng
+from skimage.data import chelsea
+from typer.testing import CliRunner
+
+import thincam_jax as tc
+from thincam_jax.commands import cli
+from thincam_jax.imaging.encoding import ORIENTATION
+from thincam_jax.imaging.operators import Separable
+from thincam_jax.units import nm, um
+
+SHAPE, DARK, FULL = (96, 128), 64, 4095
+TRUE = scene(SHAPE)
+WITHIN = 1.0  # dB
+
+
+@pytest.fixture
+def image_of(tmp_path):
+    """Image of files by `thincam reconstruct`, with options, and the names of its findings."""
+
+    def reconstruct(*options, **arrays):
+        for name, array in arrays.items():
+            tifffile.imwrite(tmp_path / f"{name}.tif", array)
+        words = {"--psf": tmp_path / "psf.tif", "--capture": tmp_path / "capture.tif"}
+        words |= {"--out": tmp_path / "image.npy", "--iterations": 60}
+        words |= dict(zip(options[::2], options[1::2], strict=True))
+        call = ["reconstruct", *(str(word) for pair in words.items() for word in pair)]
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            result = CliRunner().invoke(cli.app, call)
+        if result.exit_code:
+            assert isinstance(result.exception, SystemExit), result.exception
+            raise ValueError(result.stderr.strip().splitlines()[-1])
+        record = json.loads((tmp_path / "image.json").read_text("utf-8"))
+        image = np.atleast_3d(np.load(tmp_path / "image.npy")).mean(axis=2)
+        first = [(n - m) // 2 for n, m in zip(image.shape, SHAPE, strict=True)]
+        middle = image[first[0] : first[0] + SHAPE[0], first[1] : first[1] + SHAPE[1]]
+        said = {one["name"]: one for one in record["examination"]}
+        return middle, said | {str(one.message): None for one in told}
+
+    return reconstruct
+
+
+def pair(light, full=3600.0):
+    """Capture of the scene and its PSF, 12 bit above a black level of 64."""
+    return {"psf": counts(light, 1), "capture": counts(seen(TRUE, light), 2, full)}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("camera", [zones, diffuser])
+def test_light_that_fills_the_sensor(image_of, camera):
+    """No corner is dark: the level is found."""
+    given = pair(camera(SHAPE))
+    best = quality(image_of("--background", DARK, "--bits", 12, **given)[0], TRUE)
+    assert quality(image_of()[0], TRUE) > best - WITHIN
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("stored", ["low", "high", "float", "other"])
+def test_twelve_bits_that_nobody_told(image_of, stored):
+    """13 % of the pixels are at the top."""
+    light = cells(SHAPE, size=3)
+    view = seen(TRUE, light)
+    given = pair(light, (FULL - DARK) / np.quantile(view / view.max(), 0.87))
+    best = quality(image_of("--background", DARK, "--bits", 12, **given)[0], TRUE)
+    scale = {"low": 1, "high": 16, "float": np.float32(1 / FULL), "other": np.float32(0.3)}[stored]
+    image, said = image_of(**{name: one * scale for name, one in given.items()})
+    assert quality(image, TRUE) > best - WITHIN and "plateau" in said
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("bits", [(), ("--bits", 12)])
+@pytest.mark.parametrize("share", [0.42, 0.6])
+def test_an_overexposed_psf(image_of, share, bits):
+    """Of its bright pixels: said; two exposures are merged."""
+    light = spots(SHAPE)
+    given = pair(light)
+    best = quality(image_of("--background", DARK, "--bits", 12, **given)[0], TRUE)
+    bright = light[light > 0.1 * light.max()] / light.max()
+    full = (FULL - DARK) / np.quantile(bright, 1 - share)
+    image, said = image_of(*bits, psf=counts(light, 1, full))
+    assert quality(image, TRUE) > best - WITHIN or said["flat"]["severe"]
+
+
+def test_a_raw_file_says_pattern_and_levels(tmp_path, image_of):
+    """Pattern BGGR, black level 256: by default as by its own numbers; others are refused."""
+    light, weights = spots(SHAPE), np.array([0.5, 1.0, 0.3])[:, None, None]
+    for name, image in (("psf", light), ("capture", seen(TRUE, light))):
+        planes = weights * 3000 * image / image.max()
+        (tmp_path / f"{name}.dng").write_bytes(dng("BGGR", light=planes))
+    files = "--psf", tmp_path / "psf.dng", "--capture", tmp_path / "capture.dng"
+    best = quality(image_of(*files, "--bayer", "BGGR", "--background", 256)[0], TRUE)
+    assert quality(image_of(*files)[0], TRUE) > best - WITHIN
+    assert best > 20 and np.load(tmp_path / "image.npy").shape[-1] == 3
+    for wrong in (("--bayer", "RGGB"), ("--background", 64), ("--bits", 14)):
+        with pytest.raises(ValueError, match="give BGGR|give 256|leave --bits out"):
+            image_of(*files, *wrong)
+
+
+@pytest.mark.thorough
+def test_arrays_that_carry_meaning(image_of):
+    """Masks, NaN and other bytes of Python's arrays; NaN in a float file."""
+    light = cells(SHAPE, size=3)
+    given = {name: (one - DARK) / FULL for name, one in pair(light).items()}
+    dead = np.random.default_rng(0).random(SHAPE) < 0.02
+    spoilt = np.where(dead, 50.0, given["capture"])
+    psfs, solver = tc.Psfs(given["psf"][None]), tc.AdmmTV(iterations=60)
+    best = quality(tc.reconstruct(tc.Recording([spoilt], psfs, valid=~dead), solver).image, TRUE)
+    for capture in (np.ma.masked_array(spoilt, dead), np.where(dead, np.nan, spoilt)):
+        capture = capture.astype(">f8")  # as FITS has it
+        image = tc.reconstruct(tc.Recording([capture], psfs), solver).image
+        assert quality(image, TRUE) > best - WITHIN
+    given["capture"] = np.where(dead, np.nan, spoilt)
+    given = {name: one.astype(np.float32) for name, one in given.items()}
+    assert quality(image_of(**given)[0], TRUE) > best - WITHIN
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_photographs_are_upright_linear_light(tmp_path, suffix):
+    """By orientation 6, and by sRGB's curve; displays encode once."""
+    codes = chelsea()[:200:4, :300:4]
+    turned = PIL.Image.fromarray(np.rot90(codes).copy())
+    exif = PIL.Image.Exif()
+    exif[ORIENTATION] = 6
+    turned.save(tmp_path / f"a.{suffix}", exif=exif, quality=98)
+    values = codes / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    found = tc.load_image(tmp_path / f"a.{suffix}")
+    assert np.abs(found - linear).mean() < 0.02
+    figure = tc.plot.compare({"photograph": found})
+    shown = np.asarray(figure.axes[0].images[0].get_array())[..., :3]
+    assert np.abs(shown / shown.max() - values / values.max()).mean() < 0.03
+
+
+@pytest.mark.thorough
+def test_a_scene_wider_than_the_field():
+    """Start page's example with distance 3 in place of 2: the field that is given cuts it."""
+    mask = tc.SampledMask(np.random.default_rng(0).random((40, 40)) < 0.5, 30 * um)
+    camera = tc.LenslessCamera(mask, tc.Sensor((64, 80), 48 * um), 3.0)
+    plane = tc.ImagePlane(TRUE[:80, :120] + 0.2, distance=250.0, width=320.0)
+    noise, light = tc.GaussianNoise(snr_db=40.0), 550 * nm
+    capture = tc.capture(camera, tc.Scene(plane, light), key=0, noise=noise)
+    for field in ({}, {"field_shape": (44, 60)}):
+        optics = tc.Cameras([camera], wavelength=light, object_distance=250.0, **field)
+        result = tc.reconstruct(tc.Recording([capture], optics), tc.AdmmTV())
+        pitch = np.asarray(result.pitch)
+        truth = plane.sample(tc.Grid(result.image.shape, pitch), magnification=1.0)
+        likeness = np.corrcoef(np.ravel(result.image), np.ravel(truth))[0, 1]
+        assert likeness > 0.9 or "outside of the field: give field_shape=" in result.reason
+
+
+@pytest.mark.thorough
+def test_psf_and_capture_swapped(image_of, tmp_path):
+    given = pair(spots(SHAPE))
+    _, said = image_of(psf=given["capture"], capture=given["psf"])
+    assert said["swapped"]["severe"]
+    words = ["reconstruct", "--strict", "--out", str(tmp_path / "b.npy")]
+    files = ["--psf", str(tmp_path / "psf.tif"), "--capture", str(tmp_path / "capture.tif")]
+    result = CliRunner().invoke(cli.app, words + files)
+    assert result.exit_code == 2 and "exchange --psf and --capture" in result.stderr
+
+
+@pytest.mark.thorough
+def test_hot_pixels_in_a_psf(image_of):
+    given = pair(spots(SHAPE))
+    best = quality(image_of(**given)[0], TRUE)
+    given["psf"].flat[np.random.default_rng(3).choice(TRUE.size, 15, replace=False)] = FULL
+    image, said = image_of(psf=given["psf"])
+    assert quality(image, TRUE) > best - WITHIN and "replaced" in said
+
+
+@pytest.mark.thorough
+def test_a_background_for_each_capture(tmp_path):
+    """As a folder beside that of the captures: ambient light of a gradient each."""
+    light, slope = cells(SHAPE, size=3), np.linspace(0.2, 1, SHAPE[1])
+    for name in ("captures", "backgrounds"):
+        (tmp_path / name).mkdir()
+    tifffile.imwrite(tmp_path / "psf.tif", counts(light, 1))
+    for n in range(2):
+        ambient = np.round((500 + 300 * n) * slope * np.ones(SHAPE))
+        clean = counts(seen(TRUE, light), n, 2400)
+        for name, image in (("captures", clean + ambient), ("backgrounds", DARK + ambient)):
+            tifffile.imwrite(tmp_path / name / f"{n}.tif", image.astype(np.uint16))
+    scores = []
+    for more in ([], ["--background", str(tmp_path / "backgrounds")]):
+        files = ["--psf", str(tmp_path / "psf.tif"), "--capture", str(tmp_path / "captures")]
+        words = ["reconstruct", *files, *more, "--out", str(tmp_path / f"out{len(more)}")]
+        result = CliRunner().invoke(cli.app, [*words, "--iterations", "60"])
+        assert result.exit_code == 0, result.output
+        images = [np.load(tmp_path / f"out{len(more)}" / f"{n}.npy") for n in range(2)]
+        scores.append([quality(image, TRUE) for image in images])
+    assert min(scores[1]) > max(scores[0])
+
+
+@pytest.mark.parametrize("name", [*WRITERS, "a.pgm", "a.raw10", "a.raw12"])
+def test_formats_of_a_laboratory(tmp_path, name):
+    """The counts, or one line that gives the Python that reads them."""
+    array, path = counts(TRUE, full=3000.0) // 4, tmp_path / name
+    if name in WRITERS:
+        WRITERS[name](path, capture=array)
+    elif name == "a.pgm":
+        path.write_bytes(b"P5 128 96 4095\n" + array.astype(">u2").tobytes())
+    else:
+        path.write_bytes(packed(array, int(name[-2:]), 0))
+        with pytest.raises(tc.measured.MeasurementError, match="counts without their size") as told:
+            tc.measured.read_image(path)
+        line = str(told.value).split("; ")[1].replace("bits=10", f"bits={name[-2:]}")
+        names = {"numpy": np, "measured": tc.measured, "rows": SHAPE[0], "columns": SHAPE[1]}
+        exec(line, names)
+        path = path.with_suffix(".npy")
+    np.testing.assert_array_equal(tc.measured.read_image(path).pixels, array)
+
+
+@pytest.mark.thorough
+def test_a_code_as_fine_as_a_pixel():
+    """`Ridge("sure")` finds the noise, not the code."""
+    generator = np.random.default_rng(4)
+    left, right = (
+        np.where(generator.random((n, m)) < 0.5, 1.0, 0.0)
+        for n, m in zip((112, 150), SHAPE, strict=True)
+    )
+    clean = left @ TRUE @ right.T
+    noise = clean.std() / 100
+    capture = clean + noise * generator.normal(size=clean.shape)
+    given = {"noise_variance": noise**2, "background": 0.0}
+    recording = tc.Recording([capture], Separable(left, right), **given)
+    best = quality(tc.reconstruct(recording, tc.Ridge("sure")).image, TRUE)
+    recording = tc.Recording([capture], Separable(left, right))
+    assert quality(tc.reconstruct(recording, tc.Ridge("sure")).image, TRUE) > best - WITHIN
