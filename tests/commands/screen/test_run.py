@@ -169,7 +169,7 @@ def test_a_fault_in_the_file_is_told_with_its_line(tmp_path):
         ("screen.glass_index=1.3", "a glass of n = 1.3 cannot carry"),
         (
             "screen.bottom.height=12 mm",
-            r"smaller than one bounce of the guided light, \(0, 18.19\)",
+            r"smaller than one bounce of the guided light, \(18.19, 0\)",
         ),
     ],
 )
