@@ -164,7 +164,7 @@ def test_faults_are_told_in_one_line_with_their_place(override, part, tmp_path):
         ("screen.glass_index=1.3", "a glass of n = 1.3 cannot carry"),
         (
             "screen.bottom.height=12 mm",
-            r"smaller than one bounce of the guided light, \(0, 18.19\)",
+            r"smaller than one bounce of the guided light, \(18.19, 0\)",
         ),
     ],
 )
