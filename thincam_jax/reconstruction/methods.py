@@ -137,7 +137,7 @@ def _saying(result: Reconstruction, *reasons: str) -> Reconstruction:
 
 @checked
 def choose_solver(
-    recording: Recording, synthesis: Synthesis | None = None
+    recording: Recording, *, synthesis: Synthesis | None = None
 ) -> tuple[AbstractSolver, str]:
     """Choose `Wiener`, `AdmmTV` or `Fista`, and give the reason in a sentence.
 

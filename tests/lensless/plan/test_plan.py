@@ -296,7 +296,7 @@ def test_a_plan_notices_other_light_and_larger_planes():
     wider = [tc.ImagePlane(p.image, p.distance, 2 * p.width) for p in few.planes]
     with pytest.raises(ValueError, match=r"cover \(\d+, \d+\) samples.*make a plan"):
         tc.capture(camera(), tc.Scene(wider, few.spectrum), model=plan)
-    with pytest.raises(TypeError, match=r"scene is ImagePlane\(.*; give Scene\(planes, spectrum\)"):
+    with pytest.raises(TypeError, match=r"scene is ImagePlane\(.*; give Scene\(planes, …\)"):
         tc.plan_capture(camera(), few.planes[0], tolerance=0.1)
 
 
