@@ -8,12 +8,12 @@ import pytest
 import thincam_jax as tc
 from thincam_jax.design.phase_mask import contour_mask
 from thincam_jax.design.phase_retrieval import contour_target, match_error, retrieve_phase
-from thincam_jax.lensless import Path, masks
+from thincam_jax.lensless import LightPath, masks
 from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
 
 GRID = tc.Grid((64, 80), 4 * um)
-PATH = Path(532 * nm, 2.0)
+PATH = LightPath(532 * nm, 2.0)
 
 
 def test_contours_are_thin_lines_in_all_directions(key):

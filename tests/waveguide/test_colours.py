@@ -194,7 +194,7 @@ def test_a_plan_says_whether_cross_talk_matters():
     edge = wg.Rectangle((20.0, 0.0), (40.0, 400.0))
     for width, tolerance, crosstalk in ((70 * nm, 3e-3, "all"), (30 * nm, 0.3, "none")):
         both = camera(sensor=sensor, responses=bands(width), bottom=edge)
-        plan = wg.plan(both, lit, tolerance=tolerance)
+        plan = wg.plan_screen(both, lit, tolerance=tolerance)
         counts = 4, 32, "all", plan.level  # the bottom hologram ends after three
         exact = colour_system(both, plan.plane, *counts)(jnp.asarray(picture)[:, None])
         found = plan.system()(jnp.asarray(picture, plan.precision)[:, None])
@@ -203,4 +203,4 @@ def test_a_plan_says_whether_cross_talk_matters():
         assert plan.meets_tolerance and plan.crosstalk == crosstalk
         assert f"cross-talk  {crosstalk}: " in str(plan)
     with pytest.raises(ValueError, match=r"images are .*12, 16.*; give \(3, 'y', 'x'\), of one"):
-        wg.plan(both, LitPlane(plane(), picture[0]), tolerance=0.1)
+        wg.plan_screen(both, LitPlane(plane(), picture[0]), tolerance=0.1)

@@ -54,7 +54,7 @@ from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
 from thincam_jax.lensless.propagation.obliquity import require_off_axis
 from thincam_jax.lensless.propagation.paraxial import paraxial
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import profile_samples, radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
@@ -91,7 +91,7 @@ def psf(
     - `object_distance`: t, mm; infinity is a plane wave.
     - `at`: (y, x) of the point, mm, by default on the axis; of a plane wave the tangents of its
       angles. The shadow then moves by −d/t of it, and the waves are those about the ray through the
-      mask's middle (`thincam_jax.lensless.Path`). Of cells off both axes, and of rings,
+      mask's middle (`thincam_jax.lensless.LightPath`). Of cells off both axes, and of rings,
       "separable" then samples: for a MURA of 23 × 23 cells of 62 µm (d = 6.5 mm, averages over
       pixels of 22 µm) 0.8 % off at 20° and 30°, at azimuths of 30° and 45°; 6 % at the centres of
       pixels. A traced point counts as off both axes, unless one coordinate is a plain 0.
@@ -247,7 +247,7 @@ def _contrast(h: Float[Array, "y x"], grid: Grid, rho: Float[Array, " n"]) -> Fl
 
 
 def _irradiance(
-    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
@@ -265,7 +265,7 @@ def _irradiance(
 
 
 def _closed(
-    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     model, average = method.model, method.pixel_integration
     if model == "geometric":
@@ -277,7 +277,9 @@ def _closed(
 
 
 @jax.jit(static_argnames="method")
-def closed_terms(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> SeparableSum:
+def closed_terms(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> SeparableSum:
     """The PSF of a mask of separable terms by one of the closed forms, as separable terms."""
     h = _closed(mask, grid, path, method)
     if isinstance(h, ChirpSum):
@@ -287,7 +289,7 @@ def closed_terms(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) 
 
 
 @jax.jit(static_argnames="method")
-def _psf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _psf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         h = h.sample(grid, pixel_integration=method.pixel_integration)
@@ -295,7 +297,7 @@ def _psf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
 
 
 @jax.jit(static_argnames="method")
-def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _otf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         return h.transform(grid)
@@ -306,7 +308,9 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> PsfMethod:
+def sampled_off_axis(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> PsfMethod:
     """The method; in place of "separable" samples where a mask of edges has no closed form.
 
     That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
@@ -329,7 +333,7 @@ def sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMeth
     return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
 
 
-def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
+def _evaluate(function, camera: LenslessCamera, path: LightPath, method: PsfMethod):
     """Value of a function in the method's precision, returned in the camera's."""
     mask, grid = camera.mask, camera.sensor.grid
     tolerance = AVERAGES * (method.field_tolerance or 0.0)
@@ -369,7 +373,7 @@ def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
     return result if method.precision == own else cast(result, own)
 
 
-def _unfocused(mask: AbstractMask, path: Path) -> AbstractMask:
+def _unfocused(mask: AbstractMask, path: LightPath) -> AbstractMask:
     return eqx.error_if(
         mask,
         in_focus(mask, path),

@@ -280,7 +280,7 @@ def calibrated(path: Path, folder: Path) -> tuple[Any, ReducedMatrix]:
     **Errors**: CaptureStoreError, ValueError or OSError, one line, for what is neither.
     """
     if not path.with_name("reduced.npz").is_file():
-        recover_to(folder, calibration.open_captures(path))
+        recover_to(folder, calibration.HadamardCaptures.load(path))
         path = folder / "matrix.zarr"
     matrix = open_matrix(path)
     return matrix, ReducedMatrix.load(path.with_name("reduced.npz"), matrix)

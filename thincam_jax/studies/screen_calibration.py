@@ -133,12 +133,12 @@ def measure_matrix(
     frame = full // system.out_shape[-1], system.out_shape[-1]  # channels one below the other
     measured = []
     for number in range(math.prod(system.in_shape) // cells):  # patterns of each primary
-        kept = (lit[2] // cells == number) & (lit[1] < full)
+        bits, kept = calibration.bits, (lit[2] // cells == number) & (lit[1] < full)
         values, rows, columns = (part[kept] for part in lit)
         table = scipy.sparse.csr_array((values, (rows, columns % cells)), (full, cells))
         name = f"captures-{float(plane.distance):g}mm{f'-{number}' if number else ''}.zarr"
         with _store(folder, name, calibration) as path:
-            with measuring.create_captures(path, series, frame, bits=calibration.bits) as writer:
+            with measuring.HadamardCaptures.create(path, series, frame, bits=bits) as writer:
                 captures = measuring.simulate_captures(
                     writer,
                     Scaled(Sparse(table, plane.shape, frame), counts),

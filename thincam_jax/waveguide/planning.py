@@ -43,8 +43,8 @@ _SHARES = {"orders": 0.4, "crosstalk": 0.6, "smear": 0.6, "dispersion": 0.4, "pr
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Model of a screen's capture within a tolerance; made by `waveguide.plan`.
+class ScreenPlan:
+    """Model of a screen's capture within a tolerance; by `plan_screen`.
 
     Print it for a table. It holds for images like the one that it was made for.
 
@@ -115,12 +115,12 @@ class Plan:
             return _separable(camera, plane, float(seen_size(camera, plane)), counts, level)
 
 
-def plan(
+def plan_screen(
     camera: SeeThroughCamera | ColourCamera,
     scene: LitPlane | Sequence[LitPlane],
     *,
     tolerance: float,
-) -> Plan:
+) -> ScreenPlan:
     r"""Choose the cheapest model of the capture of a scene to a relative error.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
@@ -149,7 +149,7 @@ def plan(
     require_same("planes", "cells", [one.plane.shape for one in lit])
     plane = scene.plane if isinstance(scene, LitPlane) else tuple(one.plane for one in lit)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
-        raise TypeError("plan needs known numbers: call it outside of jit and grad")
+        raise TypeError("plan_screen needs known numbers: call it outside of jit and grad")
     channels = (camera.channels[1],) if isinstance(camera, ColourCamera) else ()
     if any(one.image.shape[:-2] != channels for one in lit) or len(lit) > 1 and channels:
         shapes = [one.image.shape for one in lit]
@@ -279,7 +279,7 @@ class _Probe:
         light = np.sum(np.abs(self._radiance(points, number)) / (1 + order) ** 1.5, axis=0)
         return np.where(rays.status[0] == RayStatus.OK, light, 0)
 
-    def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
+    def plan(self, camera, plane, tolerance: float, share: float) -> ScreenPlan:
         """The cheapest decisions, each within its part of the remaining tolerance."""
         left, shares, found = tolerance * share / _MARGIN, {}, self.reference.sum(axis=0)
         way: dict[str, Any] = {name: values[-1] for name, values in self.options.items()}
@@ -295,7 +295,7 @@ class _Probe:
         simpler = self.simpler(way, shares["precision"])
         apart = simpler.get("separable", math.inf)
         apart_serves = len(self.planes) == 1 and apart <= tolerance
-        return Plan(
+        return ScreenPlan(
             camera=camera,
             plane=plane,
             tolerance=tolerance,

@@ -162,7 +162,7 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
     return BraggRays(slope, across, wavelength, guided, left, fault)
 
 
-class Path(eqx.Module):
+class RayPath(eqx.Module):
     """Where rays meet the top hologram, (*pixel, 2), the bottom one and the object's plane, (order,
     *pixel, 2), (y, x) mm."""
 
@@ -173,7 +173,7 @@ class Path(eqx.Module):
 
 def object_points(
     camera: SeeThroughCamera, rays: BraggRays, distance: Float[Array, ""], orders: int
-) -> Path:
+) -> RayPath:
     """Paths from the lens to the object, for each order."""
     width = camera.screen.glass_thickness
     bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
@@ -183,7 +183,7 @@ def object_points(
     guided = jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
     moved = on_object(camera, rays.slope, guided + 2 * width * crossing)
     places = top, top + guided, straight_on(camera, rays.slope, distance) + moved
-    return Path(*(place[..., ::-1] for place in places))
+    return RayPath(*(place[..., ::-1] for place in places))
 
 
 def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:

@@ -11,7 +11,7 @@ from scipy.special import j0
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2, value_and_slope
 from thincam_jax.lensless.method import LATTICE_POINTS
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import (
     PROFILE_ERROR,
     irradiance,
@@ -80,7 +80,7 @@ def test_quadrature_over_the_area_of_the_mask(ring):
 @pytest.mark.parametrize("zones", [1e-4, 0.7, 3.0, 50.0, 4000.0])
 def test_disc_on_the_axis_and_at_its_rim(zones):
     """4 sin²(u/4) and ¼(1 − 2 cos(u) J₀(u) + J₀²(u)), u = 2πa²/(λd) (Lommel)."""
-    a, path = 0.1, Path(WAVELENGTH, 0.1**2 / WAVELENGTH / zones)
+    a, path = 0.1, LightPath(WAVELENGTH, 0.1**2 / WAVELENGTH / zones)
     u = 2 * np.pi * zones
     found = irradiance(tc.RadialMask([1.0], a), path, jnp.asarray([0.0, a]))
     rim = (1 - 2 * np.cos(u) * j0(u) + j0(u) ** 2) / 4

@@ -59,7 +59,7 @@ class Job:
         return self.images[0].suffix.lower() == ".png"
 
 
-class Rig:
+class Inputs:
     """`Sources`, read once."""
 
     def __init__(self, sources: Sources):

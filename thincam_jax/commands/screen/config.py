@@ -146,7 +146,7 @@ class ModelConfig(section(ScreenModel, without=("name",))):
     name: Name
 
 
-class PublishedConfig(section(PublishedImage, defaults={"psnr_db": ..., "seconds": ...})):
+class PublishedImageConfig(section(PublishedImage, defaults={"psnr_db": ..., "seconds": ...})):
     """Published figures of a target."""
 
 
@@ -156,7 +156,7 @@ class ScreenTargetConfig(PictureConfig):
     - `published`: by the method's name.
     """
 
-    published: dict[str, PublishedConfig] = {}
+    published: dict[str, PublishedImageConfig] = {}
 
 
 class CalibrationConfig(section(Calibration)):
