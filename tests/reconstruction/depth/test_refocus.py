@@ -221,7 +221,7 @@ def test_only_the_part_of_the_mask_that_the_sensor_sees_counts():
 def test_arrays_jit_and_slope():
     camera = rig.cameras()[0]
     t = np.array([20.0, 45.0, 150.0])
-    found = jax.jit(axial_resolution)(camera, t)
+    found = jax.jit(axial_resolution)(camera, object_distance=t)
     squared = [np.mean(np.square(halves(distance))) for distance in t]
     closed = np.pi * t * (t + 5.0) / (rig.BETA * 5.0 * np.array(squared))
     np.testing.assert_allclose(found, closed, rtol=1e-12)
