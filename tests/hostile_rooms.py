@@ -66,7 +66,7 @@ def at_once(function: Callable[..., Any], *names: str, **fixed: Any) -> Callable
 
 
 def denoised(network: Any, image: Any, sigma: Any) -> Any:
-    return learn.Denoiser(network)(image, sigma)
+    return learn.Denoiser.load(network)(image, sigma)
 
 
 EXPOSURES = call(tc.Exposures, beta=[25.0, 13.0], distance=6.5, wavelength=WAVE, width=5.0)
@@ -208,7 +208,7 @@ LEARNED = (
         planes=3,
         pupil=1.0,
     ),
-    call(learn.load, path="nothing", cameras=camera()),
+    call(learn.RefocusNetwork.load, path="nothing", cameras=camera()),
     call(
         learn.Suggester.load, path="nothing", model=call(design.ResponseModel, space=SPACE, **SEEN)
     ),
