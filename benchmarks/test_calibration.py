@@ -43,7 +43,7 @@ def true_operator():
     camera = wg.SeeThroughCamera(
         wg.Screen(hologram, 5.0, 1.5), tc.Sensor(SHAPE, 4.8 * um), 6.0, 10.0
     )
-    plane = wg.ObjectPlane(CELLS, 550.0, 150.0, (0.0, 27.0))
+    plane = wg.ObjectPlane(CELLS, 550.0, 150.0, (27.0, 0.0))
     camera, plane = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (camera, plane))
     system = wg.system_operator(camera, plane)
     brightest = jnp.max(system(jnp.ones(CELLS, jnp.float32)))

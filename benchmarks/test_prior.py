@@ -165,9 +165,9 @@ def screen():
         532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
     )
     sensor = tc.Sensor((110, 110), 4 * 4.8 * um)
-    places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+    places = wg.Rectangle((0.0, 0.0), (20.0, 50.0)), wg.Rectangle((25.0, 0.0), (50.0, 50.0))
     camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5, *places), sensor, 6.0, 10.0)
-    rays = wg.system_operator(camera, wg.ObjectPlane((64, 64), 550.0, 150.0, (0.0, 27.0)))
+    rays = wg.system_operator(camera, wg.ObjectPlane((64, 64), 550.0, 150.0, (27.0, 0.0)))
     dense = np.zeros((110**2, 64**2), np.float32)
     np.add.at(dense, (np.asarray(rays.rows), np.asarray(rays.columns)), np.asarray(rays.values))
     deviation = 1e-3 * dense.max()

@@ -188,6 +188,7 @@ def screen_design():
 def _by_script(name: str, picture: str, size: str = "small") -> Path:
     out = Path(tempfile.mkdtemp())
     os.environ |= {"THINCAM_SIZE": size, "THINCAM_FIGURES": str(out)}
+    sys.path.append(str(ROOT / "experiments"))  # of its tools
     runpy.run_path(str(ROOT / "experiments" / f"{name}.py"))
     return out / name / picture
 

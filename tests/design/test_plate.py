@@ -56,7 +56,7 @@ def test_expected_error_is_that_of_the_exact_system(numbers):
     plate = changed(**numbers)
     judged = judge_plate(plate, VIEWING)
     camera = plate.camera(VIEWING.sensor)
-    seen = ObjectPlane((10, 10), 550.0, 150.0, (0.0, 18.0))
+    seen = ObjectPlane((10, 10), 550.0, 150.0, (18.0, 0.0))
     operator = system_operator(camera, seen, 4, samples=6)
     matrix = np.zeros((30 * 30, 100))
     np.add.at(matrix, (np.asarray(operator.rows), np.asarray(operator.columns)), operator.values)

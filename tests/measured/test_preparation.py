@@ -269,21 +269,6 @@ def test_black_images():
     refused("the PSF has a channel of dead pixels only", grey, grey, dead=dead)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"downsample": 0}, "downsample = 0: give a whole number"),
-        ({"corner": (5, 5)}, r"corner = \(5, 5\): give two whole numbers"),
-        ({"saturation": 0.0}, "saturation = 0.0: give a number above 0, up to 1"),
-        ({"threshold": 1.5}, "threshold = 1.5: give a number above 0, up to 1"),
-        ({"noise_threshold": math.nan}, "noise_threshold = nan"),
-    ],
-)
-def test_options_out_of_range(options, message):
-    with pytest.raises(MeasurementError, match=message):
-        Preparation(**options)
-
-
 def blob(shape, pitch):
     """Two spots, irradiance at the pixels' centres; `pitch` in units of the larger pixels."""
     y, x = (pitch * (np.arange(n) - (n - 1) / 2) for n in shape)

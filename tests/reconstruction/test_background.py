@@ -13,6 +13,7 @@ import thincam_jax as tc
 from helpers import finite_difference
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.reconstruction import solve_fixed_point
+from thincam_jax.reconstruction.implicit_gradient import NeumannSeries
 from thincam_jax.reconstruction.normal_equations import normal_equations
 from thincam_jax.reconstruction.problem import InverseProblem, gradient, objective, total_misfit
 from thincam_jax.reconstruction.ridge import solve_ridge
@@ -137,13 +138,9 @@ def test_a_known_background_is_subtracted():
 
 @pytest.mark.thorough
 def test_gradients_pass_through_the_background():
-    """Of the minimiser with respect to a capture's pixel, against differences.
-
-    Less its mean: a uniform image here casts a uniform capture, so that its level is anything.
-    """
+    """Of the minimiser with respect to a capture's pixel, against differences."""
     problem = recording((3.0, -1.0), noise=0.05).problem()
     towards = jnp.asarray(RNG.random(problem.image_shape))
-    towards = towards - jnp.mean(towards)
 
     def projected(value):
         captures = (problem.captures[0].at[0, 5, 6].add(value), problem.captures[1])
@@ -157,9 +154,53 @@ def test_gradients_pass_through_the_background():
     np.testing.assert_allclose(slope, expected, rtol=1e-3)
 
 
+@pytest.mark.thorough
+def test_where_brightness_is_open_the_darkest_pixel_is_dark():
+    """In each channel and plane; a known background determines the brightness, no step is taken."""
+    psfs = np.random.default_rng(9).random((1, 2, 3, 4, 4))  # two channels of three planes
+    captures = 5 + np.random.default_rng(10).random((1, 2, 9, 12))
+    for known in ({}, {"background": 0.0}):
+        problem = tc.Recording(captures, tc.Psfs(psfs), noise_variance=1e-2, **known).problem()
+        bright = 4 + jnp.asarray(np.random.default_rng(11).random(problem.image_shape))
+        found = solve_fixed_point(problem, bright, iterations=0).image
+        darkest = bright.min(axis=(-2, -1), keepdims=True)
+        np.testing.assert_allclose(found, bright if known else bright - darkest, atol=1e-12)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("share", [None, 0.8])
+def test_the_slope_in_tau_with_a_background_to_find(share):
+    """A uniform image casts a uniform capture, so that the image's level is a choice: dark is 0.
+
+    Random PSF, and one of a few spots; the image's mean square has the slope of differences.
+    """
+    psf = np.random.default_rng(7).random((5, 6))
+    psf = psf**6 if share is None else 1.0 * (psf > share)
+    operator = tc.Recording(np.zeros((1, *SHAPE)), tc.Psfs(psf[None])).problem().operators[0]
+    chart = np.zeros((1, 1, 15, 19))
+    chart[..., 5:11, 6:14] = 1
+    seen = np.asarray(operator(jnp.asarray(chart)))[0]
+    seen = seen + 0.02 * seen.max() * np.random.default_rng(8).standard_normal(seen.shape) + 0.3
+    given = {"noise_variance": (0.02 * seen.max()) ** 2}
+
+    def found(tau):
+        problem = tc.Recording(seen[None], tc.Psfs(psf[None]), **given).problem(tau=tau)
+        blank = jnp.zeros(problem.image_shape)
+        settings = {"iterations": 4000, "tolerance": 1e-9, "adjoint": NeumannSeries(1e-8, 4000)}
+        return solve_fixed_point(problem, blank, **settings).image
+
+    def error(tau):
+        return jnp.mean((found(tau) - chart) ** 2)
+
+    slope = float(jax.grad(error)(2.0))
+    expected = float(finite_difference(jax.jit(error), jnp.asarray(2.0), jnp.asarray(1.0), 1e-2))
+    assert slope == pytest.approx(expected, rel=2e-3)
+    assert float(found(2.0).min()) == 0
+
+
 def test_the_same_background_is_sought_under_jit():
     """Captures that are known stay so, and may show that something was subtracted before."""
-    captures = jnp.asarray(np.random.default_rng(0).normal(0.1, 1, (1, 24, 30)))
+    captures = jnp.asarray(np.random.default_rng(0).normal(-1, 1, (1, 24, 30)))
     kinds = []
 
     def seek(psfs):
@@ -170,3 +211,44 @@ def test_the_same_background_is_sought_under_jit():
     seek(psfs)
     jax.jit(seek)(psfs)
     assert kinds == ["unknown", "unknown"]
+
+
+@pytest.mark.parametrize("snr_db", [20, 30, 40])
+def test_noise_around_black_is_no_background(snr_db):
+    """It is sought as not negative, unless the dark frame is several times the noise too bright.
+
+    With a camera that shows how bright an image is (PSFs of a smaller field), any negative pixels
+    over 1 % count: there a background that may be negative costs nothing.
+    """
+    psf = np.random.default_rng(1).random((1, 7, 6)) ** 6
+    blank = tc.Recording(np.zeros((1, 36, 44)), tc.Psfs(psf), noise_variance=1.0)
+    operator = blank.problem().operators[0]
+    seen = operator(jnp.zeros(operator.in_shape).at[..., 9:20, 12:30].set(1.0))[None, 0]
+    noise = float(jnp.sqrt(jnp.mean(seen**2))) * 10 ** (-snr_db / 20)
+    drawn = noise * np.random.default_rng(2).standard_normal(seen.shape)
+    kinds = [
+        tc.Recording(seen + drawn - level, tc.Psfs(psf, **field)).problem().background
+        for level in (0.0, 4 * noise)
+        for field in ({}, {"field_shape": (20, 24)})
+    ]
+    assert kinds == ["nonnegative", "unknown", "unknown", "unknown"]
+
+
+@pytest.mark.thorough
+def test_a_picture_on_black_is_as_good_as_without_a_background():
+    """Its mean square error; it was some twenty times larger."""
+    psf = np.random.default_rng(1).random((1, 7, 6)) ** 6
+    psf /= psf.sum()
+    blank = tc.Recording(np.zeros((1, 36, 44)), tc.Psfs(psf), noise_variance=1.0)
+    operator = blank.problem().operators[0]
+    picture = jnp.zeros(operator.in_shape).at[..., 9:20, 12:30].set(1.0)
+    seen = np.asarray(operator(picture))[None, 0]
+    seen = seen + 0.02 * seen.max() * np.random.default_rng(2).standard_normal(seen.shape)
+    errors = [
+        jnp.mean((tc.reconstruct(one, tc.AdmmTV(2.0)).image - picture[0, 0, 3:-3, 2:-3]) ** 2)
+        for one in (
+            tc.Recording(seen, tc.Psfs(psf)),
+            tc.Recording(seen, tc.Psfs(psf), background=0),
+        )
+    ]
+    assert float(errors[0]) < 1.2 * float(errors[1]) < 2e-3

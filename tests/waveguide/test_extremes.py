@@ -39,13 +39,13 @@ GRAZING = np.arcsin(np.sin(89.9 * deg) / 1.5)
 MET = 10.0 * np.tan(89.9 * deg) + 5.0 * np.tan(GRAZING)
 
 # name: (camera, pixel, object distance), bounds of the points in float32 and float64, status.
-BESIDE, MIDDLE = (0.0, -6.0 * np.tan(89.9 * deg)), (0.0, 0.0)
-OBLIQUE = (0.0, -6.0 * np.tan(np.arcsin(1.5 * np.sin(10.0 * deg))))
+BESIDE, MIDDLE = (-6.0 * np.tan(89.9 * deg), 0.0), (0.0, 0.0)
+OBLIQUE = (-6.0 * np.tan(np.arcsin(1.5 * np.sin(10.0 * deg))), 0.0)
 
 EXTREMES = {
     "the default": (case(), 3e-7, 1.2e-15, 0),
     "in air at 89.9°": (
-        case(recorded(60.0, GRAZING), pixel=BESIDE, top=wg.Rectangle((0.0, MET), (2.0, 2.0))),
+        case(recorded(60.0, GRAZING), pixel=BESIDE, top=wg.Rectangle((MET, 0.0), (2.0, 2.0))),
         3e-7,
         1.2e-15,
         0,
@@ -87,7 +87,7 @@ def exact(sts, pixel, distance, orders=4):
         def number(value):
             return mpmath.mpf(float(value))
 
-        x, y = (number(p) for p in pixel)
+        y, x = (number(p) for p in pixel)
         film = sts.screen.hologram
         fringes = mpmath.matrix([number(k) for k in film.grating])
         index, glass = number(film.index.value), number(sts.screen.glass_index.value)
@@ -171,12 +171,12 @@ def test_no_fringes(dtype):
         ),
         ({"film": weak(0.0)}, "diffracts no wavelength of its index's band back"),
         (
-            {"bottom": wg.Rectangle((0.0, 9.0), (20.0, 15.0))},
-            r"bottom.size = \(20, 15\) mm is smaller than one bounce .*, \(0, 18.19\) mm",
+            {"bottom": wg.Rectangle((9.0, 0.0), (15.0, 20.0))},
+            r"bottom.size = \(15, 20\) mm is smaller than one bounce .*, \(18.19, 0\) mm",
         ),
     ],
 )
 def test_screens_that_show_nothing_are_refused(screen, message):
     with pytest.raises(ValueError, match=message):
         wg.check_screen(camera(**screen))
-    wg.check_screen(camera(bottom=wg.Rectangle((0.0, 30.0), (20.0, 50.0))))
+    wg.check_screen(camera(bottom=wg.Rectangle((30.0, 0.0), (50.0, 20.0))))

@@ -13,10 +13,10 @@ from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.units import nm
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres
 
-# Of ERRATA: pixel, wavelength in nm, Θ′ in degrees, P_0, P_1 and P_3 in mm, to its last digit.
+# Of ERRATA: pixel (y, x), wavelength in nm, Θ′ in degrees, P_0, P_1, P_3 (x, y) in mm, to a digit.
 EXACT = [
     ((0, 0), 532, 61.2, (0, 9.095), (0, 27.285), (0, 63.665)),
-    ((0, 1.0536), 564.729, 54.579, (0, -92.467), (0, -78.406), (0, -50.285)),
+    ((1.0536, 0), 564.729, 54.579, (0, -92.467), (0, -78.406), (0, -50.285)),
     (
         (-1.0536, -1.0536),
         *(489.342, 67.918),
@@ -72,8 +72,9 @@ def traced(pixel, order, distance, tilt=(0.0, 0.0), index=1.5, width=5.0):
     fringes = k_recorded * np.array([0, -np.sin(angle), 1 + np.cos(angle)])
     rear, front = 0.0, width
     axes, corner = turned(tilt), np.array([0, 0, 16.0])
-    ray = axes.T @ unit(np.array([-pixel[0], -pixel[1], 6.0]))
-    point = to_plane(axes.T @ (np.array([*pixel, 0.0]) - corner), ray, rear)
+    y, x = pixel
+    ray = axes.T @ unit(np.array([-x, -y, 6.0]))
+    point = to_plane(axes.T @ (np.array([x, y, 0.0]) - corner), ray, rear)
     ray = snell(ray, 1.0, index)
     point = to_plane(point, ray, front)
     # The wavelength at which |k s − K| = k: the diffracted wave has the film's wavenumber.
@@ -123,10 +124,21 @@ def test_colours_of_the_crop():
     assert (np.diff(rows) > 0).all()
 
 
+def test_places_are_rows_before_columns():
+    """As arrays are: a rectangle of 2 by 6 mm, and pixels that lie beside each other."""
+    wide = wg.Rectangle(centre=(5.0, 1.0), size=(2.0, 6.0))
+    np.testing.assert_array_equal(wide.holds(jnp.asarray([[4.5, 3.5], [3.5, 4.5]])), [True, False])
+    sts = camera()
+    row = pixel_centres(sts)[7, 20:23]
+    assert (np.ptp(row[:, 0]), np.ptp(row[:, 1])) == pytest.approx((0, 2 * float(sts.sensor.pitch)))
+    x, y, z = np.moveaxis(np.asarray(wg.trace(sts, row, 550.0, 1).points[0]), -1, 0)
+    assert np.all(np.diff(x) < -0.1) and np.ptp(y) < 0.1 and np.ptp(z) == 0
+
+
 def test_guided_range():
     """Along x₀ = 0 from −29.87° to 46.27° in air: critical angle and grazing (Eq 5.5)."""
     angles = np.radians(np.array([-29.88, -29.86, 46.26, 46.28]))
-    pixels = jnp.stack([jnp.zeros(4), -6.0 * np.tan(angles)], axis=-1)
+    pixels = jnp.stack([-6.0 * np.tan(angles), jnp.zeros(4)], axis=-1)
     status = np.asarray(wg.trace(camera(), pixels, 550.0, 1).status[0])
     assert set(status[[1, 2]]) == {RayStatus.OK}
     assert RayStatus.OK not in status[[0, 3]]
@@ -139,7 +151,7 @@ def numbers(sts, pixel, distance):
 
 
 @pytest.mark.parametrize(
-    "pixel", [(0.0, 0.0), pytest.param((0.6, -0.9), marks=pytest.mark.thorough)]
+    "pixel", [(0.0, 0.0), pytest.param((-0.9, 0.6), marks=pytest.mark.thorough)]
 )
 @pytest.mark.parametrize("film", [1.5, pytest.param(bk7(), marks=pytest.mark.thorough)])
 def test_gradients(pixel, film):
@@ -175,13 +187,13 @@ def test_every_fault_has_a_status():
     thin_glass = camera(hologram(), 1.2)
     rays = wg.trace(thin_glass, jnp.zeros(2), 550.0)
     assert (rays.status == RayStatus.EVANESCENT).all()
-    short = camera(bottom=wg.Rectangle((0.0, 20.0), (10.0, 30.0)))
+    short = camera(bottom=wg.Rectangle((20.0, 0.0), (30.0, 10.0)))
     rays = wg.trace(short, jnp.zeros(2), 550.0)
     # Contacts at 9.1, 27.3, 45.5 and 63.7 mm; the hologram ends at 35.
     off = RayStatus.OFF_HOLOGRAM
     np.testing.assert_array_equal(rays.status, [0, 0, off, off])
     assert not rays.weight[2:].any()
-    aside = wg.trace(camera(), jnp.zeros(2), 550.0, 2, wg.Rectangle((0.0, 9.0), (5.0, 5.0)))
+    aside = wg.trace(camera(), jnp.zeros(2), 550.0, 2, wg.Rectangle((9.0, 0.0), (5.0, 5.0)))
     np.testing.assert_array_equal(aside.status, [0, RayStatus.MISSED])
     narrow = camera(hologram(CauchyIndex(1.49, 4e-9, (540e-6, 600e-6))), 1.5)
     none = wg.trace(narrow, jnp.zeros(2), 550.0)
@@ -194,6 +206,6 @@ def test_every_fault_has_a_status():
 def test_an_earlier_contact_beside_the_hologram_takes_no_light():
     """A hologram that begins after the first contact: the second is then the first ghost."""
     whole = wg.trace(camera(), jnp.zeros(2), 550.0)
-    late = wg.trace(camera(bottom=wg.Rectangle((0.0, 60.0), (10.0, 80.0))), jnp.zeros(2), 550.0)
+    late = wg.trace(camera(bottom=wg.Rectangle((60.0, 0.0), (80.0, 10.0))), jnp.zeros(2), 550.0)
     assert late.status[0] == RayStatus.OFF_HOLOGRAM
     np.testing.assert_allclose(late.weight[1:], whole.weight[:-1], rtol=1e-14)

@@ -1,7 +1,9 @@
 """Kinds of the objects that a public function or class is given, checked by its annotations."""
 
+import dataclasses
 import functools
 import inspect
+import operator
 import os
 import types
 import typing
@@ -9,12 +11,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import AbstractArray, PRNGKeyArray
 
 from thincam_jax._core import checks
-from thincam_jax._core.quantity import quantities
+from thincam_jax._core.quantity import Quantity, quantities
 
 _Public = TypeVar("_Public", bound=Callable[..., Any])
 
@@ -65,8 +68,9 @@ def checked(public: _Public) -> _Public:
         given = zip((*names, *[""] * len(args)), args, strict=False)
         args = tuple(_native(kinds.get(name), value) for name, value in given)
         kwargs = {name: _native(kinds.get(name), value) for name, value in kwargs.items()}
+        refuse_unsound(names, args, kwargs)
+        args, kwargs = _settled(args), {name: _settled(one) for name, one in kwargs.items()}
         for name, value in (*zip(names, args, strict=False), *kwargs.items()):
-            _refuse_unsound(name, value)
             allowed = kinds.get(name)
             if allowed and not any(kind.holds(value) for kind in allowed):
                 raise TypeError(f"{name} is {checks.shown(value)}; give {_words(allowed)}")
@@ -86,12 +90,38 @@ def _native(allowed: _Kinds | None, value: Any) -> Any:
     return value if kept else checks.native(value)
 
 
-def _refuse_unsound(name: str, value: Any) -> None:
+def refuse_unsound(names: Iterable[str], args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
     """Refuse numbers beyond those of floats, and lists inside themselves."""
-    if isinstance(value, int) and value.bit_length() > checks.MOST_BITS:
-        raise ValueError(f"{name} is {checks.shown(value)}; give a smaller one")
-    if isinstance(value, list | tuple) and checks.holds_itself(value):
-        raise TypeError(f"{name} is a list inside itself; give numbers")
+    for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+        if isinstance(value, int) and value.bit_length() > checks.MOST_BITS:
+            raise ValueError(f"{name} is {checks.shown(value)}; give a smaller one")
+        if isinstance(value, list | tuple) and checks.holds_itself(value):
+            raise TypeError(f"{name} is a list inside itself; give numbers")
+
+
+def _settled(value: Any) -> Any:
+    """Modules, alone or in lists, with the plain numbers that `equinox.tree_at` put into fields.
+
+    They become arrays, and are checked, as when the module is made.
+    """
+    if isinstance(value, list | tuple) and isinstance(next(iter(value), None), eqx.Module):
+        parts = [_settled(one) for one in value]
+        return value if all(map(operator.is_, parts, value)) else type(value)(parts)
+    if not isinstance(value, eqx.Module):
+        return value
+    if not any(type(leaf) in (int, float) for leaf in jax.tree.leaves(value)):
+        return value
+    fields = {field.name: field.metadata for field in dataclasses.fields(value)}
+    parts = {}
+    for name, one in vars(value).items():
+        convert = fields[name].get("converter") if type(one) in (int, float) else None
+        parts[name] = convert(one) if isinstance(convert, Quantity) else _settled(one)
+    if all(one is vars(value)[name] for name, one in parts.items()):
+        return value
+    made = object.__new__(type(value))
+    for name, one in parts.items():
+        object.__setattr__(made, name, one)
+    return made
 
 
 def _words(kinds: _Kinds) -> str:

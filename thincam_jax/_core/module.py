@@ -10,14 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import wadler_lindig as wl
 
-from thincam_jax._core.arguments import any_rank
+from thincam_jax._core.arguments import any_rank, refuse_unsound
 from thincam_jax._core.quantity import Quantity, unchecked
 
 _MOST = 4  # numbers of an array that are shown, not counted
 _PLAIN = unchecked()
 
 
-class AnyRank(eqx.Module):
+class _Sound(type(eqx.Module)):
+    """Classes whose arguments hold no list inside itself: equinox walks through them first."""
+
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+        if any(isinstance(one, list | tuple) for one in (*args, *kwargs.values())):
+            refuse_unsound(inspect.signature(cls).parameters, args, kwargs)
+        return super().__call__(*args, **kwargs)
+
+
+class AnyRank(eqx.Module, metaclass=_Sound):
     """Modules whose methods add up arrays of any ranks, whatever JAX's option says."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

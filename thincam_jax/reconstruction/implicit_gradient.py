@@ -23,7 +23,13 @@ from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.admm import RELAXATION, AbstractSplitting, Admm, admm_map
-from thincam_jax.reconstruction.problem import InverseProblem, total_misfit
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    detector_shape,
+    forward,
+    total_misfit,
+    weighted_mean,
+)
 from thincam_jax.reconstruction.regularisers import Image, prox, zero_dual
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.splittings import splitting_of
@@ -105,7 +111,10 @@ def solve_fixed_point(
     Differentiable in captures, PSFs (and so in β, d, λ that they were computed from), τ and
     weights. The gradient is that of the minimiser, not of the iteration: with few iterations, or a
     loose tolerance, it is as far from differences of results as these are from the minimum.
-    Penalties and start image do not change the minimiser, and have no gradient.
+    Penalties and start image do not change the minimiser, and have no gradient. Where a background
+    is sought and a uniform image casts a uniform capture, as with `Psfs` of the whole field, data
+    and variation leave the brightness of the image open: its darkest pixel is then 0, in each
+    channel (and each plane of its own, without a `depth_weight`).
 
     **Arguments**
 
@@ -140,10 +149,34 @@ def solve_fixed_point(
         throw=False,
     )
     return FixedPoint(
-        splitting.image(solution.value),
+        _with_level(splitting, splitting.image(solution.value)),
         jnp.asarray(solution.stats["num_steps"]),
         solution.result == optx.RESULTS.successful,
     )
+
+
+# Part of the squares of a uniform image's capture that may not be uniform.
+_UNIFORM = 1e-8
+
+
+def _with_level(splitting: AbstractSplitting, image: Image) -> Image:
+    """The image less its darkest pixel, where a background leaves its brightness open.
+
+    How bright it is then depends on the path of the iteration, which has no implicit derivative.
+    """
+    data: Any = getattr(splitting, "problem", splitting)
+    if data.background == "known":
+        return image
+    is_open = jnp.asarray(True)
+    for operator, weight in zip(data.operators, data.weights, strict=True):
+        axes = len(detector_shape(operator))
+        flat = jax.lax.stop_gradient(forward(operator, jnp.ones((1,) * 4, image.dtype)))
+        uneven = weighted_mean(weight, (flat - weighted_mean(weight, flat, axes)) ** 2, axes)
+        is_open &= (uneven <= _UNIFORM * weighted_mean(weight, flat**2, axes)).reshape(-1, 1, 1, 1)
+    own = jnp.min(image, axis=(-2, -1), keepdims=True)
+    joint = jnp.min(own, axis=-3, keepdims=True)
+    level = jnp.where(splitting.variation.depth_weight > 0, joint, own)
+    return image - jnp.where(is_open, level, 0)
 
 
 def _norm(tree: PyTree[Array]) -> Float[Array, ""]:

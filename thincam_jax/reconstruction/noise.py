@@ -18,6 +18,9 @@ _CLASSES, _LEAST = 32, 64
 _AT_ENDS = 3  # pixels of a detail that may be as dark, or as bright, as any of the capture
 _ENOUGH = 1 << 16  # details, of larger captures
 _MEDIAN = 0.6745  # of |x|, if x is normal with standard deviation 1
+# Part of a capture's pixels that may be negative anyway, and the greatest root mean square of
+# negative pixels by noise, in σ: it is 1 where the scene is black, 0.82 where it darkens evenly.
+_NEGATIVE, _BY_NOISE = 0.01, 1.4
 
 
 @jax.jit
@@ -188,6 +191,18 @@ def _variances(deviations, captures):
     found = jnp.stack([jnp.mean(d**2) for d in deviations])
     least = 1e-6 * jnp.mean(jnp.stack([jnp.mean(c**2) for c in captures]))
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))
+
+
+def is_below_black(capture: Float[Array, "*batch y x"], *, by_noise: bool) -> bool:
+    """Whether over 1 % of a known capture's pixels are negative.
+
+    - `by_noise`: whether noise around black is no reason.
+    """
+    below = capture < 0
+    if jnp.mean(below) <= _NEGATIVE or not by_noise:
+        return bool(jnp.mean(below) > _NEGATIVE)
+    deviation = jnp.sqrt(jnp.mean(estimate_noise(capture) ** 2))
+    return bool(jnp.sqrt(jnp.mean(capture**2, where=below)) > _BY_NOISE * deviation)
 
 
 def unseen_variance(

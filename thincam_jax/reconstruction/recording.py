@@ -23,7 +23,12 @@ from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome
-from thincam_jax.reconstruction.noise import estimate_variance, given_variances, unseen_variance
+from thincam_jax.reconstruction.noise import (
+    estimate_variance,
+    given_variances,
+    is_below_black,
+    unseen_variance,
+)
 from thincam_jax.reconstruction.planes import warn_of_equal_planes
 from thincam_jax.reconstruction.problem import Background, InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
@@ -36,9 +41,6 @@ from thincam_jax.reconstruction.synthesis import (
     with_channel,
 )
 from thincam_jax.reconstruction.unknown_pixels import valid_pixels, without_unknown
-
-# Part of a capture's pixels that may be negative by noise alone.
-_DARKEST = 0.01
 
 
 class Recording(Module):
@@ -60,8 +62,8 @@ class Recording(Module):
       for all captures, or one for each, that broadcasts to them. By default it is unknown behind
       `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
       (but by `Wiener`, `FringeScanning` and `PoissonTV`). It is negative only in captures that are
-      partly so. Give 0 where there is none to `Ridge` of a dark room, which is otherwise some
-      0.6 dB worse. 0 with operators.
+      partly darker than black by more than noise. Give 0 where there is none to `Ridge` of a dark
+      room, which is otherwise some 0.6 dB worse. 0 with operators.
 
     **Errors**: ValueError, one line, for captures that do not fit the imaging model.
 
@@ -301,8 +303,11 @@ class Recording(Module):
         """Not negative but in differences of captures, and if something was subtracted before."""
         if self.background is not None or isinstance(self.imaging_model, Stacked):
             return "known"
-        known = [np.asarray(c) for c in captures if not checks.is_traced(c)]
-        below = any(np.mean(c < 0) > _DARKEST for c in known)
+        # Where it leaves the brightness open, a negative background is far worse than none.
+        is_open = isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None
+        known = [c for c in captures if not checks.is_traced(c)]
+        with jax.ensure_compile_time_eval():  # captures that are known stay so under jit
+            below = any(is_below_black(c, by_noise=is_open) for c in known)
         mixed = synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))
         return "nonnegative" if nonnegative and not (below or mixed) else "unknown"
 

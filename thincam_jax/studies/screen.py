@@ -116,7 +116,7 @@ class ScreenStudy:
     sensor = tc.Sensor(shape=(22, 30), pitch=70.4 * um)
     study = ScreenStudy(
         cameras=(wg.SeeThroughCamera(wg.Screen(film, 5.0, 1.5), sensor, 6.0, 10.0),),
-        plane=wg.ObjectPlane((8, 16), distance=550.0, width=120.0, centre=(0.0, 27.0)),
+        plane=wg.ObjectPlane((8, 16), distance=550.0, width=120.0, centre=(27.0, 0.0)),
         targets={"star": siemens_star((8, 16), 4)},
         noise=tc.GaussianNoise(snr_db=40.0),
         solvers={"ridge": tc.Ridge(1.0)},
@@ -278,7 +278,7 @@ def mistaken_rays(study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mist
     width, index = camera.screen.glass_thickness, camera.screen.glass_index(found.wavelength)
     bounce = _bounce(found.guided, index)
     if mistake == "ghost_index":
-        return replace(rays, points=rays.points - 2 * width * bounce[..., None, :])
+        return replace(rays, points=rays.points - 2 * width * bounce[..., None, ::-1])
     if study.recording_angles is None:
         raise ValueError(
             "the mistake 'grating' is one of the recording; give the study recording_angles"
@@ -291,7 +291,7 @@ def mistaken_rays(study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mist
     guided = film[..., None] * printed.diffracted(directions(found.across, film))[..., :2]
     odd = (2 * jnp.arange(study.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
     moved = odd * width * (_bounce(guided, index) - bounce)
-    return replace(rays, points=rays.points + moved[..., None, :])
+    return replace(rays, points=rays.points + moved[..., None, ::-1])
 
 
 def _bounce(guided: Array, index: Array) -> Array:

@@ -440,6 +440,6 @@ def _true_values(study: ScreenStudy) -> dict[str, float]:
         "plate_x": float(camera.tilt[0]),
         "plate_y": float(camera.tilt[1]),
         "object_distance": float(plane.distance),
-        "object_x": float(plane.centre[0]),
-        "object_y": float(plane.centre[1]),
+        "object_x": float(plane.centre[1]),
+        "object_y": float(plane.centre[0]),
     }

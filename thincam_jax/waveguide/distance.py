@@ -131,7 +131,7 @@ def distance_from_ghosts(
     )
     screen = wg.Screen(hologram, glass_thickness=5.0, glass_index=1.5)
     camera = wg.SeeThroughCamera(screen, tc.Sensor((44, 36), 48 * um), 6.0, 10.0)
-    plane = wg.ObjectPlane((80, 80), distance=430.0, width=250.0, centre=(0.0, 60.0))
+    plane = wg.ObjectPlane((80, 80), distance=430.0, width=250.0, centre=(60.0, 0.0))
     picture = jnp.asarray(resize(sample_image("camera", linear=True), (80, 80)), jnp.float32)
     capture = wg.system_operator(camera, plane)(picture)
     found = wg.distance_from_ghosts(camera, np.asarray(capture), nearest=300.0, farthest=1000.0)
@@ -235,7 +235,7 @@ def _places(camera: SeeThroughCamera, distance: float, orders: int) -> np.ndarra
     pixels = pixel_centres(camera)
     found = np.asarray(_sources(camera, pixels, jnp.asarray(distance, pixels.dtype), orders), float)
     middle = (np.array(camera.sensor.shape) - 1) / 2
-    return found[..., ::-1] / float(camera.sensor.pitch) + middle
+    return found / float(camera.sensor.pitch) + middle
 
 
 @eqx.filter_jit

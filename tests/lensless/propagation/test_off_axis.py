@@ -348,11 +348,6 @@ def test_cells_are_continuous_at_the_axis_and_have_slopes():
     assert float(jax.grad(value)(0.2)) == pytest.approx(float(difference), rel=1e-5)
 
 
-def test_a_point_behind_the_mask_is_refused():
-    with pytest.raises(ValueError, match="object_distance = -10"):
-        tc.psf(camera_of(), wavelength=500 * nm, object_distance=-10.0, at=(0.0, 1.0))
-
-
 @pytest.mark.thorough
 def test_along_an_axis_both_forms_agree():
     """That of products, and that of a point which may be anywhere."""

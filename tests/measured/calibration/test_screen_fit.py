@@ -31,12 +31,12 @@ def camera(reference=61.2, glass=5.0, lens=10.0, tilt=0.0, pixels=(22, 30), pitc
     return wg.SeeThroughCamera(wg.Screen(film, glass, 1.5), tc.Sensor(pixels, pitch), 6.0, lens)
 
 
-def plane(distance=550.0, centre=(0.0, 27.0), shape=CELLS):
+def plane(distance=550.0, centre=(27.0, 0.0), shape=CELLS):
     return wg.ObjectPlane(shape, distance, 150.0, centre)
 
 
 TRUE = {"reference": 61.7, "glass": 5.1, "lens": 10.6, "tilt": 0.01}
-CENTRE = (0.8, 27.9)
+CENTRE = (27.9, 0.8)
 VALUES = {
     "glass_thickness": 5.1,
     "lens_distance": 10.6,
@@ -50,11 +50,11 @@ VALUES = {
 def ghosts(deviation, true=TRUE, orders=3, leaning=(0.0, 0.0)):
     """A dot for every order of twelve pixels, the middle of its band, with an error."""
     random = np.random.default_rng(0)
-    pixels = random.uniform(-1, 1, (12, 2))
+    pixels = random.uniform(-1, 1, (12, 2))[:, ::-1]
     sts = eqx.tree_at(lambda c: c.tilt, camera(**true), jnp.asarray(leaning))
     seen = trace_band(sts, jnp.asarray(pixels), 550.0, orders, 1).points[:, :, 0]
     points = (np.asarray(seen) - CENTRE).reshape(-1, 2)
-    noisy = points + deviation * random.normal(size=points.shape)
+    noisy = points + deviation * random.normal(size=points.shape)[:, ::-1]
     return GhostPositions(
         np.tile(pixels, (orders, 1)), noisy, np.repeat(np.arange(orders), 12), deviation
     )
@@ -141,7 +141,7 @@ def test_a_screen_from_its_matrix(optimised):
 @pytest.mark.thorough
 def test_edges_of_holograms_that_cut_bands():
     """Weights of cut bands are in the model; without, values are 50 standard errors off."""
-    bottom = wg.Rectangle((0.0, 22.5), (50.0, 45.0))  # the second ghost's light ends about it
+    bottom = wg.Rectangle((22.5, 0.0), (45.0, 50.0))  # the second ghost's light ends about it
 
     def cut(glass):
         given = camera(pixels=(7, 9), pitch=200.0 * um, glass=glass)

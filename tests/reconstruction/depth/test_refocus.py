@@ -245,16 +245,3 @@ def test_distances_are_even_in_one_over_t():
     assert distances[0] == pytest.approx(100)
     assert distances[-1] == pytest.approx(220)
     np.testing.assert_allclose(np.diff(1 / distances), np.diff(1 / distances)[0], rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        ((200.0, 100.0, 5), "is not below farthest"),
-        ((0.0, 100.0, 5), "not positive"),
-        ((100.0, 200.0, 1), "give at least 2"),
-    ],
-)
-def test_bad_ranges_are_refused(arguments, part):
-    with pytest.raises(ValueError, match=part):
-        refocus_distances(*arguments)

@@ -72,7 +72,7 @@ class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
     height: Length
 
     def build(self, **others: Any) -> wg.Rectangle:
-        return wg.Rectangle((self.x, self.y), (self.width, self.height))
+        return wg.Rectangle((self.y, self.x), (self.height, self.width))
 
 
 class PlateConfig(section(wg.Screen, without=("hologram",), defaults={"glass_index": 1.5})):

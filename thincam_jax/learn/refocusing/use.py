@@ -83,8 +83,8 @@ class Learned(AbstractSolver):
     may be made up where the capture does not tell: see `Reconstruction.consistency` and
     `Reconstruction.confidence`.
 
-    - `network`: trained, see `RefocusNetwork.load`; default the one that comes with the package, for
-      its camera.
+    - `network`: trained, see `RefocusNetwork.load`; default the one that comes with the package,
+      for its camera.
     - `output`: "focus", or "all_in_focus", which needs no distance.
 
     **Errors**: ValueError, one line, for another camera, a distance outside of what the network

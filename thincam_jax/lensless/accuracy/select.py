@@ -63,18 +63,6 @@ class Selection(Prediction):
       errors are counted from.
     - `reasons`: one sentence for every effect left out, with its size.
     - `considered`: the predictions that the choice was made from, cheapest first.
-
-    ```python
-    import thincam_jax as tc
-    from thincam_jax.units import nm, um
-
-    mask = tc.FresnelZoneAperture(25.0, width=1.6)
-    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    choice = tc.choose_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
-    print(choice.meets_tolerance)  # True
-    ```
-
-    **See also**: `choose_model`.
     """
 
     meets_tolerance: bool

@@ -45,19 +45,6 @@ class CapturePlan:
     - `cost`, `full_cost`: cost of the plan, and of computing every plane and wavelength.
     - `shares`: predicted errors of the single decisions.
     - `effects`: effects that the capture holds and those that it leaves out.
-
-    ```python
-    import thincam_jax as tc
-    from thincam_jax.units import nm, um
-
-    mask = tc.FresnelZoneAperture(25.0, width=1.6)
-    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    planes = [tc.ImagePlane([[0.0, 1.0]], d, width=0.2 * d) for d in (200.0, 210.0)]
-    plan = tc.plan_capture(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
-    print(len(plan.distances))  # 1
-    ```
-
-    **See also**: `plan_capture`.
     """
 
     camera: LenslessCamera

@@ -58,8 +58,8 @@ _PLACES = {
     "film_thickness": ("camera.screen.hologram.thickness", ...),
     "index_modulation": ("camera.screen.hologram.index_modulation", ...),
     "object_distance": ("plane.distance", ...),
-    "object_x": ("plane.centre", 0),
-    "object_y": ("plane.centre", 1),
+    "object_x": ("plane.centre", 1),
+    "object_y": ("plane.centre", 0),
     "gain": ("gain", ...),
 }
 _FIELDS = quantities(VolumeHologram, Screen, SeeThroughCamera, ObjectPlane)
@@ -80,8 +80,8 @@ _UNEXPLAINED = 5.0  # standard deviations of χ² of positions, at most
 class GhostPositions(eqx.Module):
     """Object points seen by pixels: a dot on a monitor, and the pixels lit by its ghosts.
 
-    - `pixels`: (x, y) on the sensor, mm from its middle, (ghost, 2).
-    - `points`: points of the object, (x, y) mm from its middle, (ghost, 2).
+    - `pixels`: (y, x) on the sensor, mm from its middle, (ghost, 2).
+    - `points`: points of the object, (y, x) mm from its middle, (ghost, 2).
     - `orders`: order of each ghost; 0 is the image.
     - `deviation`: standard deviation of the points, mm.
     """
@@ -366,7 +366,7 @@ def _smear(problem: _Problem, samples: int | None) -> _Smear:
     camera, distance = problem.start.camera, problem.start.plane.distance
     band = trace_band(camera, problem.pixels, distance, problem.count, samples)
     rays = trace(camera, problem.pixels, distance, problem.count)
-    away = band.points - rays.points[..., None, :2]
+    away = band.points - rays.points[..., None, 1::-1]
     mean = jnp.sum(rays.weight) / jnp.sum(band.weight)
     offsets = jnp.where(band.weight[..., None, None] > 0, away, 0)
     return _Smear(offsets, mean * band.weight, rays.weight)
@@ -416,12 +416,12 @@ def _model(state: _State, problem: _Problem):
     rays = trace(camera, problem.pixels, plane.distance, problem.count)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
-        centroid = rays.points[..., :2] + jnp.mean(problem.smear.offsets, axis=2)
+        centroid = rays.points[..., 1::-1] + jnp.mean(problem.smear.offsets, axis=2)
         return centroid[problem.orders, place] - plane.centre
     size = seen_size(camera, plane)
     offsets = problem.smear.offsets
-    points = rays.points[..., None, :2] + offsets
-    down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0))
+    points = rays.points[..., None, 1::-1] + offsets
+    down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (0, 1))
     weight = state.gain * problem.smear.weight(rays.weight) / problem.full / offsets.shape[2]
     return jnp.einsum("op,opsy,opsx->pyx", weight, down, across, precision="highest")
 
@@ -431,7 +431,7 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
 
     The second difference of F(u) = ∫ Φ(v/σ) dv with the normal distribution Φ, max(u, 0) for σ = 0.
     """
-    number = plane.shape[1 - axis]
+    number = plane.shape[axis]
     low = (points - size / 2 - plane.centre[axis]) / plane.pitch + number / 2
     edges = jnp.arange(number + 1, dtype=low.dtype)
     wide = jnp.where(blur > 0, blur, 1.0)
