@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge
 from thincam_jax.measured.raw import Raw
 
 
-class Shot(TypedDict):
+class FrameRecord(TypedDict):
     """Record of a frame: when it was `taken` (UTC), the camera's `number` and `time` (s), the
     `exposure` (s), the stage's `position` (mm or None), the `saturated` pixels."""
 
@@ -31,7 +31,7 @@ class Shot(TypedDict):
     retries: int
 
 
-class Provenance(TypedDict, total=False):
+class Provenance(TypedDict):
     """Record of a run: its devices, and the settings `asked` for; `plan`: hash of the plan."""
 
     plan: str
@@ -39,7 +39,7 @@ class Provenance(TypedDict, total=False):
     versions: dict[str, str]
     procedure: dict[str, float | int | None]
     asked: list[dict[str, object]]
-    display_shape: tuple[int, int]
+    display_shape: NotRequired[tuple[int, int]]
     begun: str
 
 
@@ -55,7 +55,7 @@ class Acquisition:
     settings: tuple[CameraSettings, ...]
     bits: int
     sensor_shape: tuple[int, int]
-    shots: tuple[Shot, ...]
+    shots: tuple[FrameRecord, ...]
     provenance: Provenance
 
     @classmethod
