@@ -321,7 +321,7 @@ def test_what_is_no_frame_is_one_line_and_nothing_is_lost(path, monkeypatch, kin
     monkeypatch.undo()
     assert len(CaptureStore(path).digests) == len(PLAN.steps)
     with pytest.raises(CaptureStoreError, match="18 of 23 frames are missing"):
-        read_acquisition(path)
+        Acquisition.load(path)
     assert run(world, path).complete
     require_whole(path)
 
