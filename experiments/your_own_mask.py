@@ -40,7 +40,7 @@ WAVELENGTH, DISTANCE = 550 * nm, 1.0
 MARKS = (0, 1, 4, 9, 15, 22, 32, 34) if SIZE == "full" else (0, 1, 4, 9, 11)
 
 
-class GolombSlits(tc.AbstractFactoredMask):
+class GolombSlits(tc.lensless.masks.AbstractFactoredMask):
     """Slits at the marks of a Golomb ruler, crossed with the same slits."""
 
     slit: jax.Array  # width of a slit, mm

@@ -11,9 +11,10 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
 
 - cameras: `LenslessCamera`, `Sensor`; `waveguide.SeeThroughCamera`
 - masks: `FresnelZoneAperture`, `ModifiedUniformlyRedundantArray`, `SeparableMask`, `Pinhole`,
-  `RadialMask`, `LensletArray`, `PhaseMask`, `SampledMask`; own ones by `AbstractFactoredMask`
+  `RadialMask`, `LensletArray`, `PhaseMask`, `SampledMask`; own ones by
+  `lensless.masks.AbstractFactoredMask`
 - scenes: `ImagePlane`, `Scene`, `Spectrum`, `load_image`, `imaging.targets`
-- simulation: `psf`, `otf`, `mtf`, `capture`, `field_operator`, `GaussianNoise`,
+- simulation: `psf`, `otf`, `mtf`, `capture`, `record`, `field_operator`, `GaussianNoise`,
   `PoissonGaussianNoise`
 - accuracy: `choose_model`, `predict_error`, `plan_capture`, `PsfMethod`
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,

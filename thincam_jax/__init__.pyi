@@ -27,7 +27,6 @@ from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.exposures import Exposures as Exposures
 from .lensless.field import field_operator as field_operator
-from .lensless.masks.base import AbstractFactoredMask as AbstractFactoredMask
 from .lensless.masks.cells import SeparableMask as SeparableMask
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from .lensless.masks.lenslets import LensletArray as LensletArray
@@ -57,6 +56,7 @@ from .reconstruction.methods import choose_solver as choose_solver
 from .reconstruction.methods import reconstruct as reconstruct
 from .reconstruction.poisson import PoissonTV as PoissonTV
 from .reconstruction.psf_check import check_psf as check_psf
+from .reconstruction.record import record as record
 from .reconstruction.recording import Recording as Recording
 from .reconstruction.refinement import refine as refine
 from .reconstruction.ridge import Ridge as Ridge

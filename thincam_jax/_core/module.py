@@ -1,8 +1,9 @@
 """Modules that print the values of their numbers, with units."""
 
 import dataclasses
+import difflib
 import inspect
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from thincam_jax._core.quantity import Quantity, unchecked
 
 _MOST = 4  # numbers of an array that are shown, not counted
 _PLAIN = unchecked()
+_Kind = TypeVar("_Kind")
 
 
 if TYPE_CHECKING:  # a metaclass of one's own hides the arguments of a module
@@ -56,6 +58,16 @@ class Module(AnyRank):
             converter = getattr(field, "metadata", {}).get("converter")
             if isinstance(converter, Quantity):
                 converter.name = name
+
+    def replace(self: _Kind, **changes: Any) -> _Kind:
+        """This object with other values of some arguments, as `camera.replace(distance=3.0)`."""
+        names = list(inspect.signature(type(self)).parameters)
+        for name in changes:
+            if name not in names:
+                near = difflib.get_close_matches(name, names) or names
+                raise TypeError(f"{type(self).__name__} has no {name}; give {', '.join(near)}")
+        kept = {name: getattr(self, name) for name in names if hasattr(self, name)}
+        return type(self)(**kept | changes)
 
     def __pdoc__(self, **kwargs: Any) -> wl.AbstractDoc:
         """Document for equinox's printer, of this object or of one inside another."""

@@ -1,5 +1,6 @@
 """Scenes: flat images at distances, and the light they send."""
 
+import os
 from collections.abc import Iterable
 from typing import Any
 
@@ -218,3 +219,21 @@ class Scene(Module):
             raise ValueError(
                 f"planes have different batch shapes {sorted(batches)}; make them equal"
             )
+
+    @classmethod
+    def photograph(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        distance: Number,
+        width: Number,
+        wavelength: Spectrum | Numbers = 550e-6,
+    ) -> "Scene":
+        """A photograph on a screen: its linear light, upright, colours as a batch (`load_image`).
+
+        - `distance`, `width`: of the screen, mm. `wavelength`: mm, or a `Spectrum`: the light of
+          each colour alike, by default 550 nm.
+        """
+        from thincam_jax.imaging.targets.images import load_image  # slow, of other libraries
+
+        return cls(ImagePlane(load_image(path), distance, width), wavelength)

@@ -18,11 +18,12 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity, unchecked
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank, Resampled
+from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import field_fit, tangents_of
 from thincam_jax.lensless.light import light_over_field
 from thincam_jax.lensless.method import MODELS, Model, PsfMethod, as_method
-from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.psf import spectral_psf
 
 _DARK = 0.3  # share of a PSF's absolute sum
 
@@ -62,7 +63,7 @@ class Cameras(Module):
 
     - `cameras`: one for each capture. Captures at several mask-sensor distances are enlarged to
       the scale of the largest (`register`), and their PSFs with them.
-    - `wavelength`: mm, one or one for each camera.
+    - `wavelength`: mm, one or one for each camera; or a `Spectrum`, over which PSFs are summed.
     - `object_distance`: t, mm, of the focus. Several give as many planes, each in its own
       projection: the same pixel of all planes lies on one ray through the mask.
     - `field_shape`: pixels of the image, p·t/d apart on the object, d the largest distance; the
@@ -164,9 +165,20 @@ class Cameras(Module):
         return max(self.cameras, key=lambda c: float(c.distance))
 
     @property
+    def colours(self) -> list[list[tuple[Any, Any]]]:
+        """Wavelengths of each camera's light, mm, with their weights."""
+        if isinstance(self.wavelength, Spectrum):
+            light = self.wavelength
+            return [list(zip(light.wavelengths, light.weights, strict=True))] * self.count
+        return [[(wavelength, 1.0)] for wavelength in self.wavelengths]
+
+    @property
     def wavelengths(self) -> Float[Array, " camera"]:
-        """λ of each camera, mm."""
-        light = checks.array("wavelength", self.wavelength)
+        """λ of each camera, mm; the mean of a spectrum."""
+        light = self.wavelength
+        if isinstance(light, Spectrum):
+            light = jnp.sum(light.wavelengths * light.weights) / jnp.sum(light.weights)
+        light = checks.array("wavelength", light)
         if light.shape not in ((), (self.count,)):
             raise ValueError(
                 f"wavelength has shape {light.shape}; give one number in mm, or one for each of "
@@ -204,9 +216,9 @@ class Cameras(Module):
             )
         method, distance = as_method(self.model, self.pixel_integration), self.object_distance
         ratios, operators = distance_ratios(self.cameras), []
-        for camera, light, ratio in zip(self.cameras, self.wavelengths, ratios, strict=True):
+        for camera, colours, ratio in zip(self.cameras, self.colours, ratios, strict=True):
             own = own_field(field, ratio)
-            one = field_fit(camera, [(light, 1.0)], distance, own, method).operator
+            one = field_fit(camera, colours, distance, own, method).operator
             dtype, sizes = one.weights.dtype, zip(field, own, strict=True)
             matrices = (_coarser(n, few, ratio).astype(dtype) for n, few in sizes)
             operators.append(one if ratio == 1 else Resampled(one, *matrices))
@@ -221,12 +233,9 @@ class Cameras(Module):
         if not distances.size:
             raise ValueError("object_distance is empty; give one in mm, or one for each plane")
         kernels, method = [], as_method(self.model, self.pixel_integration)
-        for camera, wavelength, ratio in zip(self.cameras, self.wavelengths, ratios, strict=True):
-            wide = camera.on_grid(kernel_grid(camera.sensor.grid, own_field(field, ratio)))
-            planes = [
-                psf(wide, wavelength=wavelength, object_distance=distance, model=method)
-                for distance in distances
-            ]
+        for camera, colours, ratio in zip(self.cameras, self.colours, ratios, strict=True):
+            grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
+            planes = [spectral_psf(camera, colours, d, method, grid) for d in distances]
             kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
         return kernels
 

@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import functools
+import sys
 import time
 from typing import ClassVar
 
@@ -73,7 +74,7 @@ _SETTLED = 100
 @checked
 def reconstruct(
     recording: Recording,
-    solver: AbstractSolver | None = None,
+    solver: AbstractSolver | str | None = None,
     *,
     start: Float[Array, "..."] | None = None,
     callback: Callback | None = None,
@@ -84,8 +85,9 @@ def reconstruct(
 
     - `recording`: captures with their imaging model and noise, see `Recording`.
     - `solver`: the method with its settings: `Wiener`, `FringeScanning` (filters, for `Cameras`),
-      `AdmmTV`, `Fista`, `Ridge` or `PoissonTV`. Default: the one of `choose_solver`; the result
-      has its reason.
+      `AdmmTV`, `Fista`, `Ridge`, `PoissonTV` or `PlugAndPlay`; or the name of one with its
+      defaults: "wiener", "fringe_scanning", "admm_tv", "fista", "ridge", "poisson", "pnp". Default:
+      the one of `choose_solver`; the result has its reason.
     - `start`: a start image, such as an earlier result. By default it is uniform with cameras,
       matrices and `LowRank` operators and for `PoissonTV`, else black. With a start image `AdmmTV`
       omits its first part without the uniform light, see docs/guide/reconstruct.md.
@@ -116,6 +118,8 @@ def reconstruct(
     reason = ""
     if solver is None:
         solver, reason = choose_solver(recording)
+    elif isinstance(solver, str):
+        solver = named_solver(solver)
     if isinstance(solver, AbstractIterativeSolver):
         if any(checks.is_traced(capture) for capture in recording.captures):
             raise TypeError(
@@ -445,3 +449,13 @@ class Fista(AbstractRegularised):
 SOLVERS: dict[str, type[AbstractSolver]] = {
     solver.name: solver for solver in (Wiener, FringeScanning, AdmmTV, Fista, Ridge, PoissonTV)
 }
+
+# Solvers of later packages, by their names of the first page.
+_BEYOND = {"pnp": "PlugAndPlay"}
+
+
+def named_solver(name: str) -> AbstractSolver:
+    """The solver of a name, with its defaults."""
+    checks.choice("solver", name, (*SOLVERS, *_BEYOND))
+    kind = SOLVERS.get(name) or getattr(sys.modules["thincam_jax"], _BEYOND[name])
+    return kind()

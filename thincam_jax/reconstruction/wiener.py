@@ -22,7 +22,8 @@ from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid, kernel_shape
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.method import as_method
+from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.reconstruction.imaging_model import (
     Cameras,
     Psfs,
@@ -115,12 +116,12 @@ class WienerSynthesis(eqx.Module):
             next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in matrix
         )
         object_distance = cameras.object_distance
-        how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
+        method = as_method(cameras.model, cameras.pixel_integration)
         kernels, uniform = [], []
-        for camera, w, ratio in zip(each, cameras.wavelengths, capture_ratios, strict=True):
+        for camera, colours, ratio in zip(each, cameras.colours, capture_ratios, strict=True):
             own = own_field(self.field_shape, ratio)
-            wide = camera.on_grid(kernel_grid(sensor, own))
-            h = psf(wide, wavelength=w, object_distance=object_distance, **how)
+            grid = kernel_grid(sensor, own)
+            h = spectral_psf(camera, colours, object_distance, method, grid)
             kernels.append(h)
             cover = jnp.asarray(_coverage(own, self.field_shape, ratio), dtype=h.dtype)
             uniform.append(_convolve(CropConvolution(h, sensor.pitch, sensor.shape, own), cover))

@@ -1,6 +1,7 @@
 """Coded masks: what the light passes on its way to the sensor."""
 
 from thincam_jax._core.names import modules_of
+from thincam_jax.lensless.masks.base import AbstractFactoredMask as AbstractFactoredMask
 from thincam_jax.lensless.masks.base import AxisFactors as AxisFactors
 from thincam_jax.lensless.masks.base import MaskTerms as MaskTerms
 from thincam_jax.lensless.masks.cells import maximum_length_sequence as maximum_length_sequence

@@ -1,0 +1,104 @@
+"""Simulated recordings, the names of solvers, and changes of one number."""
+
+import numpy as np
+import PIL.Image
+import pytest
+import skimage.data
+
+import thincam_jax as tc
+from thincam_jax.units import deg, nm, um
+
+SENSOR = tc.Sensor((40, 52), 60 * um)
+CELLS = np.random.default_rng(0).random((20, 20)) < 0.4
+CAMERA = tc.LenslessCamera(tc.SampledMask(CELLS, 60 * um), SENSOR, distance=3.0)
+ZONES = [
+    tc.LenslessCamera(tc.FresnelZoneAperture(12.0, phase, width=1.6), SENSOR, distance)
+    for phase, distance in ((0.0, 4.0), (270 * deg, 4.0), (0.0, 3.0))
+]
+PICTURE = skimage.data.camera()[::16, ::16] / 255.0
+
+
+def scene(width=120.0, distance=250.0, **light):
+    return tc.Scene(tc.ImagePlane(PICTURE, distance, width), **light or {"wavelength": 550 * nm})
+
+
+def test_one_camera_is_captured_as_by_capture():
+    noise = tc.GaussianNoise(30.0)
+    recording = tc.record(CAMERA, scene(), noise=30.0, key=3)
+    expected = tc.capture(CAMERA, scene(), noise=noise, key=3)
+    np.testing.assert_array_equal(recording.captures[0], expected)
+    np.testing.assert_allclose(recording.noise_variance, noise.variance(expected))
+    optics = recording.imaging_model
+    assert float(optics.object_distance) == 250.0 and float(optics.wavelength) == 550 * nm
+    # Pixels of 60 µm · 250/3 on the object, of the parity of the sensor's.
+    assert optics.field_shape == (24, 24)
+
+
+def test_several_cameras_have_noise_of_their_own():
+    """The field is that of the largest distance."""
+    alike = [ZONES[0], ZONES[0], ZONES[2]]
+    recording = tc.record(alike, scene(), noise=20.0)
+    first, second, third = map(np.asarray, recording.captures)
+    assert not np.allclose(first, second) and recording.imaging_model.field_shape == (32, 32)
+    assert recording.noise_variance[0] != recording.noise_variance[2]
+    assert tc.record(ZONES[0], scene()).noise_variance is None
+
+
+def test_the_field_ends_where_the_sensor_sees_nothing():
+    optics = tc.record(CAMERA, scene(width=4000.0)).imaging_model
+    assert optics.field_shape == optics.seen_field
+
+
+@pytest.mark.thorough
+def test_planes_and_spectra_are_those_of_the_scene():
+    """A polychromatic recording explains its capture, which the mean wavelength does not."""
+    near, far = (tc.ImagePlane(PICTURE, d, 0.4 * d) for d in (100.0, 300.0))
+    optics = tc.record(CAMERA, tc.Scene([far, near], 550 * nm)).imaging_model
+    np.testing.assert_array_equal(optics.object_distance, [100.0, 300.0])
+    light = tc.Spectrum([420 * nm, 680 * nm], [0.5, 0.5])
+    fine = tc.LenslessCamera(tc.FresnelZoneAperture(40.0, width=1.6), SENSOR, 6.0)
+    recording = tc.record(fine, scene(width=60.0, spectrum=light))
+    truth = recording.problem().operators[0]
+    shape = recording.problem().image_shape[-2:]
+    grid = tc.Grid(shape, recording.imaging_model.pitch)
+    image = recording.oriented(scene(60.0).planes[0].sample(grid, magnification=1.0))
+    error = truth(image[None, None])[0] - recording.captures[0]
+    assert np.linalg.norm(error) < 0.02 * np.linalg.norm(recording.captures[0])
+    optics = recording.imaging_model
+    alone = recording.replace(imaging_model=optics.replace(wavelength=550 * nm))
+    h, mean = (one.imaging_model.kernels((40, 52), [1.0])[0] for one in (recording, alone))
+    assert np.linalg.norm(h - mean) > 0.02 * np.linalg.norm(h)
+    wiener = tc.reconstruct(recording, "wiener").image
+    assert not np.allclose(wiener, tc.reconstruct(alone, "wiener").image, rtol=1e-3)
+
+
+@pytest.mark.thorough
+def test_three_lines_to_an_image(tmp_path):
+    """A photograph in colours, by the name of a solver."""
+    PIL.Image.fromarray(skimage.data.chelsea()[::6, ::6]).save(tmp_path / "photo.png")
+    view = tc.Scene.photograph(tmp_path / "photo.png", distance=250.0, width=160.0)
+    recording = tc.record(CAMERA, view, noise=35.0, key=0)
+    result = tc.reconstruct(recording, "admm_tv")
+    grid = tc.Grid(result.image.shape[-2:], np.asarray(result.pitch))
+    truth = view.planes[0].sample(grid, magnification=1.0)
+    assert result.image.shape[0] == 3
+    assert np.corrcoef(np.ravel(truth), np.ravel(result.image))[0, 1] > 0.9
+
+
+def test_solvers_by_name():
+    recording = tc.record(CAMERA, scene())
+    image = tc.reconstruct(recording, "wiener").image
+    np.testing.assert_array_equal(image, tc.reconstruct(recording, tc.Wiener()).image)
+    with pytest.raises(ValueError, match=r"'weiner' is unknown; choose one of 'wiener', .*'pnp'"):
+        tc.reconstruct(recording, "weiner")
+
+
+def test_changes_of_one_number():
+    moved = CAMERA.replace(distance=4.0)
+    assert float(moved.distance) == 4.0 and moved.mask is CAMERA.mask
+    assert float(ZONES[0].mask.replace(beta=20.0).beta) == 20.0
+    assert tc.AdmmTV(3.0).replace(iterations=7).iterations == 7
+    recording = tc.record(CAMERA, scene())
+    assert recording.replace(background=0.0).background is not None
+    with pytest.raises(TypeError, match="LenslessCamera has no distanse; give distance"):
+        CAMERA.replace(distanse=3.0)

@@ -1,0 +1,79 @@
+"""Simulated recordings: captures of a scene, with the imaging model that it has."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
+from thincam_jax._core.random import random_key
+from thincam_jax.imaging.scene import Scene
+from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.capture import capture
+from thincam_jax.lensless.forward import projected_shape
+from thincam_jax.lensless.method import Model, PsfMethod
+from thincam_jax.reconstruction.imaging_model import Cameras
+from thincam_jax.reconstruction.recording import Recording
+
+
+@checked
+def record(
+    camera: LenslessCamera | Sequence[LenslessCamera],
+    scene: Scene,
+    *,
+    noise: AbstractNoise | float | int | None = None,
+    key: Any = 0,
+    model: Model | PsfMethod = "separable",
+) -> Recording:
+    """Capture a scene by one camera or several, with all that its reconstruction needs.
+
+    The recording has the scene's light and distances, and the field that its planes fill, as far
+    as the sensor sees it.
+
+    **Arguments**
+
+    - `camera`: one, or one for each capture: phases, pitches, distances.
+    - `noise`: its signal-to-noise ratio in dB (`GaussianNoise`), or a noise; None for none.
+    - `key`: seed of the noise, or a key; each capture has a noise of its own.
+    - `model`: PSF model of captures and reconstruction, see `psf`.
+
+    **Returns** a `Recording` for `reconstruct`. `capture` gives the array alone.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 550e-6)
+    result = tc.reconstruct(tc.record(camera, scene, noise=30.0))
+    ```
+
+    **See also**: `capture`, `Recording`, `Scene.photograph`.
+    """
+    cameras = [camera] if isinstance(camera, LenslessCamera) else list(camera)
+    noise = GaussianNoise(noise) if isinstance(noise, float | int) else noise
+    distances = [plane.distance for plane in scene.planes]
+    light = scene.spectrum
+    optics = Cameras(
+        cameras,
+        wavelength=light if light.wavelengths.size > 1 else light.wavelengths[0],
+        object_distance=distances[0] if len(distances) == 1 else np.unique(distances),
+        model=model,
+    )
+    key = random_key(key)
+    keys = [key] if len(cameras) == 1 else jax.random.split(key, len(cameras))
+    captures = [
+        capture(one, scene, noise=noise, key=k, model=model)
+        for one, k in zip(cameras, keys, strict=True)
+    ]
+    known = isinstance(noise, GaussianNoise) and not any(map(checks.is_traced, captures))
+    variances = [float(np.mean(noise.variance(c))) for c in captures] if known else None
+    if not checks.holds_traced(scene, cameras):
+        covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]
+        widest = np.minimum(np.max(covers, axis=0), optics.seen_field)
+        optics = optics.replace(field_shape=tuple(int(n) for n in widest))
+    return Recording(captures, optics, noise_variance=variances)
