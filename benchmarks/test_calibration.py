@@ -18,12 +18,7 @@ import pytest
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators.masked import Scaled
-from thincam_jax.measured.calibration import (
-    HadamardSeries,
-    create_captures,
-    open_captures,
-    simulate_captures,
-)
+from thincam_jax.measured.calibration import HadamardCaptures, HadamardSeries, simulate_captures
 from thincam_jax.measured.calibration.hadamard import walsh_hadamard
 from thincam_jax.units import deg, nm, um
 
@@ -33,8 +28,8 @@ RECOVER = """
 import resource, sys, time
 import numpy as np
 start = time.perf_counter()
-from thincam_jax.measured.calibration import open_captures, recover_matrix
-matrix = recover_matrix(open_captures(sys.argv[1])).matrix.block_until_ready()
+from thincam_jax.measured.calibration import HadamardCaptures, recover_matrix
+matrix = recover_matrix(HadamardCaptures.load(sys.argv[1])).matrix.block_until_ready()
 seconds = time.perf_counter() - start
 print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 np.save(sys.argv[2], np.asarray(matrix[::997]))
@@ -48,7 +43,7 @@ def true_operator():
     camera = wg.SeeThroughCamera(
         wg.Screen(hologram, 5.0, 1.5), tc.Sensor(SHAPE, 4.8 * um), 6.0, 10.0
     )
-    plane = wg.ObjectPlane(CELLS, 550.0, 150.0, (0.0, 27.0))
+    plane = wg.ObjectPlane(CELLS, 550.0, 150.0, (27.0, 0.0))
     camera, plane = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (camera, plane))
     system = wg.system_operator(camera, plane)
     brightest = jnp.max(system(jnp.ones(CELLS, jnp.float32)))
@@ -59,7 +54,7 @@ def true_operator():
 def store(tmp_path_factory):
     path = tmp_path_factory.mktemp("full") / "captures.zarr"
     series = HadamardSeries(CELLS, display="binary", dark_frames=16)
-    writer = create_captures(path, series, SHAPE, bits=12)
+    writer = HadamardCaptures.create(path, series, SHAPE, bits=12)
     return simulate_captures(
         writer, true_operator(), jax.random.key(0), deviation=NOISE, offset=100.0
     )
@@ -67,7 +62,7 @@ def store(tmp_path_factory):
 
 @pytest.mark.benchmark(group="calibration")
 def test_recovery(benchmark, store, tmp_path, capsys):
-    benchmark.pedantic(lambda: open_captures(store.path))
+    benchmark.pedantic(lambda: HadamardCaptures.load(store.path))
     done = subprocess.run(
         [sys.executable, "-c", RECOVER, store.path, tmp_path / "some.npy"],
         stdout=subprocess.PIPE,

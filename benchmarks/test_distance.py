@@ -48,7 +48,7 @@ def camera(shape):
     hologram = wg.VolumeHologram.record(
         532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
     )
-    places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+    places = wg.Rectangle((0.0, 0.0), (20.0, 50.0)), wg.Rectangle((25.0, 0.0), (50.0, 50.0))
     screen = wg.Screen(hologram, 5.0, 1.5, *places)
     return wg.SeeThroughCamera(screen, tc.Sensor(shape, 32 * um), 6.0, 10.0)
 
@@ -57,7 +57,7 @@ def captured(one, picture, distance, width, snr, rng):
     """A capture with white noise; pictures wider than the field go on below it."""
     field = max(one.sensor.shape) * float(one.sensor.pitch) / 6.0 * (10.0 + distance)
     below = 0.5 * field * (width - 1.06) if width > 1 else 0.0
-    plane = wg.ObjectPlane((CELLS, CELLS), distance, field * width, (0.0, 9.1 + below))
+    plane = wg.ObjectPlane((CELLS, CELLS), distance, field * width, (9.1 + below, 0.0))
     clean = np.asarray(wg.system_operator(one, plane, samples=6)(picture), float)
     deviation = np.sqrt(np.mean(clean**2)) * 10 ** (-snr / 20)
     return clean + deviation * rng.standard_normal(clean.shape)

@@ -14,7 +14,7 @@ import pytest
 import scipy.special
 
 import thincam_jax as tc
-from thincam_jax.lensless import Path
+from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable
@@ -27,10 +27,12 @@ RESULTS: dict[str, tuple[float, float]] = {}
 def psf(model, cell, distance):
     mask = tc.ModifiedUniformlyRedundantArray(ORDER, cell, centre=jnp.zeros(2, cell.dtype))
     grid = tc.Grid(SHAPE, jnp.asarray(PITCH, cell.dtype))
-    path = Path(jnp.asarray(WAVELENGTH, cell.dtype), distance, jnp.asarray(jnp.inf, cell.dtype))
+    path = LightPath(
+        jnp.asarray(WAVELENGTH, cell.dtype), distance, jnp.asarray(jnp.inf, cell.dtype)
+    )
     if model == "separable":
-        return separable(mask, grid, path).image()
-    method = PsfMethod("angular_spectrum", mask_shape=SHAPE)
+        return separable(mask, grid, path, pixel_integration=False).image()
+    method = PsfMethod("angular_spectrum", pixel_integration=False, mask_shape=SHAPE)
     return angular_spectrum(mask, grid, path, method, padding=2.0)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.lensless import Path
+from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable
 
@@ -42,10 +42,10 @@ def psf(model, beta, distance, wavelength, object_distance, oversampling=1, padd
         fill_factor=jnp.ones((), dtype),
     )
     grid = tc.Grid(SHAPE, jnp.asarray(PITCH, dtype))
-    path = Path(wavelength, distance, object_distance)
+    path = LightPath(wavelength, distance, object_distance)
     if model == "separable":
-        return separable(mask, grid, path).image()
-    method = tc.PsfMethod(model, oversampling=oversampling, mask_shape=SHAPE)
+        return separable(mask, grid, path, pixel_integration=False).image()
+    method = tc.PsfMethod(model, None, False, oversampling, SHAPE)
     return angular_spectrum(mask, grid, path, method, padding=padding)
 
 

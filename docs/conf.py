@@ -119,7 +119,6 @@ MODULES = (
     "learn.refocusing.sources",
     "learn.refocusing.train",
     "learn.refocusing.use",
-    "learn.suggester_training",
     "learn.training",
     "lensless.masks.display",
     "lensless.masks.reliefs",

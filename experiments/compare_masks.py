@@ -9,26 +9,23 @@ before? At full size some six minutes of one core. Lengths are in mm.
 # sphinx_gallery_thumbnail_path = "images/which-mask.png"
 
 import os
-import sys
 from pathlib import Path
 
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+from tools.mask_captures import ComparedMask, Setting
+from tools.mask_comparison import ComparedScene, MaskComparison, Tuning, draw_error, draw_images
 
 import thincam_jax as tc
 from thincam_jax.design.phase_mask import mask_of_phase, one_turn
 from thincam_jax.design.phase_retrieval import contour_target, retrieve_phase
 from thincam_jax.imaging.targets import middle_square, sample_image
 from thincam_jax.imaging.targets.patterns import point_grid
-from thincam_jax.lensless import Path as LightPath
+from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence, random_cells
 from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
-
-sys.path.append(str(Path(__file__).parent / "tools"))
-from mask_captures import ComparedMask, Setting
-from mask_comparison import ComparedScene, MaskComparison, Tuning, draw_error, draw_images
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": large pixels, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "compare_masks"

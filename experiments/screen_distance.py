@@ -36,7 +36,7 @@ pixels, cells, samples = {"full": (88, 200, 8), "small": (44, 100, None)}[SIZE]
 hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
 )
-places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+places = wg.Rectangle((0.0, 0.0), (20.0, 50.0)), wg.Rectangle((25.0, 0.0), (50.0, 50.0))
 sensor = tc.Sensor((pixels, pixels), 2112 * um / pixels)
 camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5, *places), sensor, 6.0, 10.0)
 
@@ -44,7 +44,7 @@ camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5, *places), sensor, 6.0
 def capture(picture, distance, seed):
     """At 40 dB; the picture has the same angular size at all distances and fills the field."""
     field = 0.352 * (10.0 + distance)
-    plane = wg.ObjectPlane(picture.shape, distance, 1.5 * field, (0.0, 9.1 + 0.22 * field))
+    plane = wg.ObjectPlane(picture.shape, distance, 1.5 * field, (9.1 + 0.22 * field, 0.0))
     clean = np.asarray(wg.system_operator(camera, plane, samples=samples)(jnp.asarray(picture)))
     deviation = np.sqrt(np.mean(clean**2)) * 10 ** (-40 / 20)
     return clean + deviation * np.random.default_rng(seed).standard_normal(clean.shape)

@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.hardware import CameraSettings, acquire, plans, read_acquisition
+from thincam_jax.hardware import Acquisition, CameraSettings, acquire, plans
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.virtual import VirtualRig
 from thincam_jax.hardware.virtual.optics import ModulatorOptics
@@ -72,12 +72,12 @@ settings = CameraSettings(exposure=20e-3, pixel_format="Mono12")
 plan = plans.method_b(mask, (25.0, 21.0), settings, dark_frames=1).at_position(0.0)
 with (
     tempfile.TemporaryDirectory() as folder,
-    tc.hardware.open_rig(drivers, display_pitch, virtual) as rig,
+    tc.hardware.open_rig(drivers, display_pitch, virtual=virtual) as rig,
 ):
     shown = [rig.render(plan.pattern(step)) for step in plan.steps]
     procedure = Procedure(settle=5e-3, timeout=2.0, saturated=0.01)
     outcome = acquire(plan, rig, Path(folder) / "frames.zarr", procedure=procedure)
-    taken = read_acquisition(outcome.path)
+    taken = Acquisition.load(outcome.path)
     frames = jnp.asarray(taken.captures())  # without the dark frame, counts
 print(f"{outcome.total} frames by {taken.provenance['devices']['camera']['model']}")
 for step, seconds in outcome.seconds.items():

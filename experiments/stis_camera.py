@@ -66,7 +66,7 @@ camera = wg.SeeThroughCamera(screen, sensor, distance, gap)
 # image's distance; but the ghost's is 600 mm, not 567.)
 
 axis = ghost_images(camera, jnp.zeros((1, 2)), far, orders)
-places, sources = np.asarray(axis.places)[:, 0, 1], np.asarray(axis.distance)[:, 0]
+places, sources = np.asarray(axis.places)[:, 0, 0], np.asarray(axis.distance)[:, 0]
 apart = 1e3 * (places[1] - places[0]) / distance
 print(f"first ghost {apart:.1f} mrad away, sources at {np.round(sources)} mm")
 front = distance + gap + 5.0  # z of the plate's front surface
@@ -75,8 +75,8 @@ for order, grey in enumerate(("0.0", "0.4", "0.65")):
     for m in (-width / 2, width / 2):
         # The ray's direction is that to the order's virtual source.
         slope = -places[order] / distance - m / sources[order]
-        pixel = jnp.asarray([[0.0, -distance * slope]])
-        ray = wg.trace(camera, pixel, far, orders)
+        pixel = jnp.asarray([[-distance * slope, 0.0]])
+        ray = wg.trace(camera, pixel, object_distance=far, orders=orders)
         bounce = 5.0 * float(ray.guided[0, 1]) / np.sqrt(1.5**2 - float(ray.guided[0, 1]) ** 2)
         inside = slope / np.sqrt(1 + slope**2) / 1.5
         crossing = 5.0 * inside / np.sqrt(1 - inside**2)
@@ -114,7 +114,12 @@ def plate(centre):
 def shadow(mask_at, sensor, grid, wavelength, source, place):
     """What a mask casts, with its middle imaged at a place of the sensor."""
     lensless = tc.LenslessCamera(mask_at(place / (1 + distance / source)), sensor, distance)
-    return tc.psf(lensless.on_grid(grid), wavelength=wavelength, object_distance=source)
+    return tc.psf(
+        lensless.on_grid(grid),
+        wavelength=wavelength,
+        object_distance=source,
+        pixel_integration=False,
+    )
 
 
 grid = kernel_grid(sensor.grid, field)
@@ -124,7 +129,7 @@ figure, axes = plt.subplots(1, orders, figsize=(13, 3.4), layout="constrained")
 half = grid.shape[0] / 2 * float(pitch)
 weights = np.asarray(axis.weight)[:, 0]
 for order, ax in enumerate(axes):
-    parts = (axis.wavelength, axis.distance, axis.places[..., ::-1])
+    parts = (axis.wavelength, axis.distance, axis.places)
     image = zone_plate(*(part[order, 0] for part in parts))
     drawn = ax.imshow(np.asarray(image), cmap="gray", extent=(-half, half, half, -half))
     part = weights[order] / weights.sum()
@@ -156,10 +161,10 @@ figure.savefig(FIGURES / "transfer.png", dpi=110)
 
 
 def field_points(shape, count):
-    """First images, (x, y) mm, of `count`² points of a field from its first to its last sample."""
+    """First images, (y, x) mm, of `count`² points of a field from its first to its last sample."""
     ends = [(n - 1) / 2 * float(pitch) for n in shape]
     y, x = (np.linspace(-end, end, count) for end in ends)
-    return jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1), jnp.float32)
+    return jnp.asarray(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1), jnp.float32)
 
 
 @partial(jax.jit, static_argnames="mask_psf")

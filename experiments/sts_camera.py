@@ -45,7 +45,7 @@ sensor = tc.Sensor((440 // binned, 440 // binned), 4.8 * um * binned)
 hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
 )
-places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+places = wg.Rectangle((0.0, 0.0), (20.0, 50.0)), wg.Rectangle((25.0, 0.0), (50.0, 50.0))
 
 
 def see_through(glass=5.0):
@@ -66,8 +66,8 @@ distance, orders = 550.0, 4  # of the object, mm; of ghosts
 figure, ax = plt.subplots(figsize=(10, 4.2), layout="constrained")
 greys = [("0.0", "-"), ("0.45", "--"), ("0.65", ":")]
 for (grey, dashes), pixel in zip(greys, (-0.9, 0.0, 0.9), strict=True):
-    along = np.array([[0.0, pixel]])
-    rays = wg.trace(camera, jnp.asarray(along), distance, 3)
+    along = np.array([[pixel, 0.0]])
+    rays = wg.trace(camera, jnp.asarray(along), object_distance=distance, orders=3)
     slope = -pixel / 6.0  # of the ray in air
     inside = slope / np.sqrt(1 + slope**2) / 1.5
     crossing = 5.0 * inside / np.sqrt(1 - inside**2)
@@ -97,7 +97,7 @@ figure.savefig(FIGURES / "rays.png", dpi=110)
 # ghosts' distance on the object varies too: no convolution describes this camera.
 
 pixels = pixel_centres(camera)
-rays = wg.trace(camera, pixels, distance, orders)
+rays = wg.trace(camera, pixels, object_distance=distance, orders=orders)
 colours = np.asarray(rays.wavelength) / nm
 shifts = np.asarray(rays.points[1] - rays.points[0])[..., 1]
 print(f"colours {colours.min():.0f} to {colours.max():.0f} nm")
@@ -121,12 +121,12 @@ figure.savefig(FIGURES / "field.png", dpi=110)
 # paths in the glass: a ghost is smeared along the screen, wider with every order, and the side
 # lobes of the band show in it. Grey is what a pixel sees.
 
-middle = wg.trace(camera, jnp.zeros((1, 2)), distance, 3)
+middle = wg.trace(camera, jnp.zeros((1, 2)), object_distance=distance, orders=3)
 band = trace_band(camera, jnp.zeros((1, 2)), distance, 3, 2048)
 pixel_seen = 4.8e-3 * binned * (10.0 + distance) / 6.0
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
 for order, ax in enumerate(axes):
-    away = np.asarray(band.points[order, 0, :, 1] - middle.points[order, 0, 1])
+    away = np.asarray(band.points[order, 0, :, 0] - middle.points[order, 0, 1])
     ax.hist(away, np.linspace(-4, 4, 121), color="0.3", density=True)
     ax.axvspan(-pixel_seen / 2, pixel_seen / 2, color="0.85", zorder=0)
     ax.set(xlabel="y from the Bragg ray's end (mm)", title=f"order {order}")
@@ -141,14 +141,14 @@ figure.savefig(FIGURES / "smear.png", dpi=110)
 # matrix H, and the reconstruction that of every camera: total variation by ADMM. What if the model
 # is wrong: ghosts forgotten, or the glass taken for 2 % thicker than it is?
 
-plane = wg.ObjectPlane((64, 64), distance, 150.0, (0.0, 27.0))
-system = wg.system_operator(camera, plane, orders)
+plane = wg.ObjectPlane((64, 64), distance, 150.0, (27.0, 0.0))
+system = wg.system_operator(camera, plane, orders=orders)
 scenes = {"camera": resize(sample_image("camera", linear=True), (64, 64))}
 scenes["text"] = resize(sample_image("page", linear=True)[:180, :180], (64, 64))
 models = {
     "right model": system,
-    "glass 2 % thicker": wg.system_operator(see_through(5.1), plane, orders),
-    "without ghosts": wg.system_operator(camera, plane, 1),
+    "glass 2 % thicker": wg.system_operator(see_through(5.1), plane, orders=orders),
+    "without ghosts": wg.system_operator(camera, plane, orders=1),
 }
 iterations = {"full": 100, "small": 30}[SIZE]
 images, reached = {}, {}
@@ -202,7 +202,7 @@ cameras = [
 ]
 bands = [wg.ColourBand(centre, 80 * nm) for centre in (610 * nm, 535 * nm, 465 * nm)]
 colour = wg.ColourCamera(cameras, bands)
-cells = wg.ObjectPlane((24, 24), distance, 150.0, (0.0, 27.0))
+cells = wg.ObjectPlane((24, 24), distance, 150.0, (27.0, 0.0))
 mixed, separated = (colour_system(colour, cells, orders, 4, kind) for kind in ("all", "none"))
 face = np.moveaxis(resize(sample_image("astronaut", linear=True), (24, 24)), -1, 0)[:, None]
 clean = mixed(jnp.asarray(face, jnp.float32))

@@ -82,7 +82,7 @@ RIG |= {"nearer": 0, "blur": 0, "corners": 0, "well": 13500, "bits": 12, "exposu
 
 recorded = {"index": 1.5, "thickness": 16 * um, "index_modulation": 0.02}
 film = wg.VolumeHologram.record(532 * nm, 0.0, 61.2 * deg, **recorded)
-outlines = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+outlines = wg.Rectangle((0.0, 0.0), (20.0, 50.0)), wg.Rectangle((25.0, 0.0), (50.0, 50.0))
 sensor = tc.Sensor((pixels, pixels), 19.2 * um * 112 / pixels)
 camera = wg.SeeThroughCamera(wg.Screen(film, 5.0, 1.5, *outlines), sensor, 6.0, 10.0)
 radius = np.hypot(*np.meshgrid(*[np.linspace(-1, 1, pixels, dtype=np.float32)] * 2)) / 1.4142
@@ -92,8 +92,8 @@ patterns = np.stack([hadamard_pattern(n, shape, "natural") > 0 for n in numbers]
 
 @functools.cache
 def rays(shift=0.0, nearer=0.0):
-    plane = wg.ObjectPlane(shape, 550.0 - nearer, 110.0, (shift, 20.0 + shift))
-    return wg.system_operator(camera, plane, 4, 8)
+    plane = wg.ObjectPlane(shape, 550.0 - nearer, 110.0, (20.0 + shift, shift))
+    return wg.system_operator(camera, plane, orders=4, samples=8)
 
 
 def frames(setup, system, shown, random):

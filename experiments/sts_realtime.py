@@ -44,9 +44,9 @@ hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
 )
 sensor = tc.Sensor((pixels, pixels), 440 * 4.8 * um / pixels)
-places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+places = wg.Rectangle((0.0, 0.0), (20.0, 50.0)), wg.Rectangle((25.0, 0.0), (50.0, 50.0))
 camera = wg.SeeThroughCamera(wg.Screen(hologram, 5.0, 1.5, *places), sensor, 6.0, 10.0)
-plane = wg.ObjectPlane((cells, cells), 550.0, 150.0, (0.0, 27.0))
+plane = wg.ObjectPlane((cells, cells), 550.0, 150.0, (27.0, 0.0))
 rays = wg.system_operator(camera, plane)
 where = (np.asarray(rays.rows), np.asarray(rays.columns))
 model = scipy.sparse.csr_array(
@@ -75,15 +75,17 @@ captures = [c + deviation * jax.random.normal(k, c.shape) for c, k in zip(clean,
 # - pixels averaged 2 × 2, which loses what tells them apart.
 
 shapes = (cells, cells), (pixels, pixels)
-spots = rng.uniform(-1, 1, (12, 2))  # mm on the sensor
-points = np.asarray(wg.trace(camera, spots, plane.distance, 3).points)[..., :2]
-points = points - np.asarray(plane.centre) + 0.3 * rng.standard_normal(points.shape)
+spots = rng.uniform(-1, 1, (12, 2))[:, ::-1]  # (y, x), mm on the sensor
+points = np.asarray(wg.trace(camera, spots, object_distance=plane.distance, orders=3).points)[
+    ..., 1::-1
+]
+points = points - np.asarray(plane.centre) + 0.3 * rng.standard_normal(points.shape)[..., ::-1]
 ghosts = GhostPositions(
     np.tile(spots, (3, 1)), points.reshape(-1, 2), np.repeat(np.arange(3), 12), 0.3
 )
 start = wg.SeeThroughCamera(wg.Screen(hologram, 5.1, 1.5, *places), sensor, 6.0, 10.0)
 free = ("glass_thickness", "slant", "tilt", "object_x", "object_y")
-fit = fit_screen(ghosts, start, plane, free, samples=None)
+fit = fit_screen(ghosts, start, plane, parameters=free, samples=None)
 glass, error = fit.values["glass_thickness"], fit.standard_errors["glass_thickness"]
 print(f"fitted glass {glass:.3f} ± {error:.3f} mm, {fit.status}")
 

@@ -31,7 +31,6 @@ import jax
 import jaxtyping
 import pytest
 from checked_types import checked
-from jax._src.interpreters import mlir
 
 from helpers import ROOT
 
@@ -49,12 +48,6 @@ jax.config.update("jax_traceback_in_locations_limit", 0)  # lines in HLO that no
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "programs"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-# JAX sets up a compiler context, with all dialects, for every program: here one serves them all. It
-# is a quarter of the time. tests/test_default_flags.py runs its sample without.
-if os.environ["XLA_FLAGS"]:
-    CONTEXT, NEW_CONTEXT = mlir.make_ir_context(), mlir.make_ir_context
-    mlir.make_ir_context = lambda: CONTEXT if mlir.ir.Context.current is None else NEW_CONTEXT()
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.jaxtyped = checked

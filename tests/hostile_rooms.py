@@ -30,7 +30,7 @@ from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
 from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
-from thincam_jax.hardware.acquisition.plan import Plan, Step
+from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
@@ -38,8 +38,6 @@ from thincam_jax.hardware.stages.zaber import ZaberStage
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.network import NetworkOptions
-from thincam_jax.learn.suggester_training import SuggesterTraining
-from thincam_jax.learn.suggestions import Suggester
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.measured import calibration
@@ -197,7 +195,6 @@ STUDIES = (
 LEARNED = (
     call(TrainingOptions, steps=5, rate=1e-3, warm_up=2, averaging=0.9, seed=0, falling=0.5),
     call(NetworkOptions, steps=2, widths=(8, 8)),
-    call(SuggesterTraining, samples=8, guesses=1, width=4, depth=1, rate=1e-3),
     call(
         RefocusCamera,
         camera=camera(),
@@ -209,24 +206,8 @@ LEARNED = (
         pupil=1.0,
     ),
     call(learn.load, path="nothing", cameras=camera()),
-    call(
-        learn.Suggester.load, path="nothing", model=call(design.ResponseModel, space=SPACE, **SEEN)
-    ),
     call(denoised, network="shipped", image=IMAGE, sigma=0.1),
     call(tc.PlugAndPlay, denoiser="shipped", strength=1.0, iterations=2, tolerance=1e-3),
-    call(
-        learn.suggest,
-        suggester=call(
-            Suggester,
-            model=call(design.ResponseModel, space=SPACE, **SEEN, rings=8),
-            key=KEY,
-            guesses=2,
-            width=4,
-            depth=1,
-        ),
-        target=np.ones(8),
-        tolerance_db=1.0,
-    ),
 )
 SETTINGS = call(
     hardware.CameraSettings,
@@ -251,11 +232,11 @@ RIGS = (
     call(plans.psf_stack, mask=PLATE, depths=[5.0, 6.5], settings=SETTINGS, stage_zero=1.0),
     call(plans.hadamard, series=SERIES, settings=SETTINGS),
     call(
-        at_once(Plan, "patterns", "settings", "steps"),
+        at_once(AcquisitionPlan, "patterns", "settings", "steps"),
         name="a",
         patterns=PLATE,
         settings=SETTINGS,
-        steps=call(Step, pattern=0, position=1.0, settings=0, dark=False),
+        steps=call(AcquisitionStep, pattern=0, position=1.0, settings=0, dark=False),
         facts={"a": 1.0},
     ),
     call(

@@ -135,7 +135,7 @@ THROUGH = call(
     focal_distance=6.0,
     lens_distance=10.0,
 )
-BEHIND = call(wg.ObjectPlane, shape=(5, 4), distance=550.0, width=20.0, centre=(0.0, 15.0))
+BEHIND = call(wg.ObjectPlane, shape=(5, 4), distance=550.0, width=20.0, centre=(15.0, 0.0))
 RAW = call(measured.Raw, pixels=(4000 * RANDOM.random((12, 16))).astype(np.uint16), bits=12)
 
 

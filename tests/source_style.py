@@ -54,6 +54,19 @@ def tables_of_units(modules: list[Module]) -> list[str]:
     ]
 
 
+def names_of_two_classes(modules: list[Module]) -> list[str]:
+    """The name of a class has one meaning in the package; a private one in its file."""
+    places: dict[str, str] = {}
+    return [
+        f"{module.path}:{node.lineno}: {node.name} is a class of {places[node.name]}, too"
+        for module in modules
+        for node in module.tree.body
+        if isinstance(node, ast.ClassDef)
+        and not node.name.startswith("_")
+        and places.setdefault(node.name, module.path) != module.path
+    ]
+
+
 # All that an assertion may be made of: it is for the type checker, and `python -O` leaves it out.
 _ASSERTED = (ast.BoolOp, ast.boolop, ast.Compare, ast.cmpop, ast.Attribute, ast.Name, ast.Load)
 
@@ -253,6 +266,7 @@ STYLE_RULES = (
     bare_files,
     tables_of_units,
     named_tuples,
+    names_of_two_classes,
     many_parameters,
     star_imports,
     long_modules,
@@ -300,6 +314,12 @@ BROKEN_STYLE = [
         "design/space.py",
         "R = {'beta': Reported('β', 'rad/mm²'), 'index': (unchecked(unit='mm'), 0.1)}",
         "space.py:1: a",
+    ),
+    (
+        names_of_two_classes,
+        "waveguide/z.py",
+        "\n\nclass A: ...",
+        "z.py:3: A is a class of units.py",
     ),
     (named_tuples, "lensless/psf.py", "class A(NamedTuple): ...", "psf.py:1: a named tuple"),
     (named_tuples, "units.py", "A = collections.namedtuple('A', 'x')", "units.py:1: "),

@@ -176,6 +176,9 @@ def test_a_name_that_is_not_there():
         (tc, "select_model", "choose_model"),
         (tc, "plan", "plan_capture"),
         (tc.measured, "read_mask", "read_pixel_map"),
+        (tc.lensless, "Path", "LightPath"),
+        (tc.waveguide, "plan", "plan_screen"),
+        (tc.hardware, "read_acquisition", "Acquisition"),
     ],
 )
 def test_a_former_name_leads_to_the_one_of_today(package, name, nearest):

@@ -25,15 +25,16 @@ MODULES = (
     *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
     *("design.plate", "design.ranking", "design.sensitivity"),
     *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
-    *("learn.suggester_training", "learn.suggestions", "lensless.masks.reliefs"),
+    "lensless.masks.reliefs",
     *("measured.calibration.screen_fit", "measured.exposures", "measured.sensor"),
     *("reconstruction.depth.find", "reconstruction.problem"),
+    *("studies.evaluate", "studies.prepared", "studies.rig_images", "waveguide.distance"),
     *("studies.response", "studies.study", "waveguide.colours"),
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.
 WITHIN = {"draw_batch", "linear_objective", "match_objective", "restored_objective", "drawn_error"}
-WITHIN |= {"FrontSearch", "Suggester", "Training", "TrainingDescents", "adjoint_error"}
+WITHIN |= {"FrontSearch", "Training", "TrainingDescents", "adjoint_error"}
 
 
 def faces() -> dict[str, object]:

@@ -14,7 +14,7 @@ from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.sensor import AbstractNoise
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.scenes import LAYERS, PARTS, Scene, captured
+from thincam_jax.learn.refocusing.scenes import LAYERS, PARTS, LayeredScene, captured
 
 
 def flat_scene(
@@ -22,7 +22,7 @@ def flat_scene(
     pictures: Sequence[Num[ArrayLike, "y x"]],
     covers: Sequence[Num[ArrayLike, "y x"]],
     distances: Sequence[float | int],
-) -> Scene:
+) -> LayeredScene:
     """Flat layers from the front to the back.
 
     **Arguments**, up to three of each: `pictures` (y, x), radiance; `covers` (y, x), 0 to 1, that
@@ -37,7 +37,7 @@ def flat_scene(
     dtype, shape = camera.near.dtype, camera.field_shape
     nothing = [np.zeros(shape)] * missing
     inverse = 1 / np.asarray([*[distances[0]] * missing, *distances], float)
-    return Scene(
+    return LayeredScene(
         jnp.asarray(np.stack([*nothing, *pictures]), dtype),
         jnp.asarray(np.stack([*nothing, *covers]), dtype),
         jnp.zeros((LAYERS, PARTS, *shape), dtype).at[:, PARTS // 2].set(1),
@@ -46,7 +46,7 @@ def flat_scene(
 
 
 def capture_scene(
-    camera: RefocusCamera, scene: Scene, noise: AbstractNoise, key: PRNGKeyArray
+    camera: RefocusCamera, scene: LayeredScene, noise: AbstractNoise, key: PRNGKeyArray
 ) -> tuple[Float[Array, "y x"], Float[Array, ""]]:
     """The capture of a scene, and the root mean square of its noise."""
     return with_noise(captured(camera, scene.emission(camera), scene.inverse), noise, key)
@@ -68,14 +68,14 @@ def with_noise(
 
 
 def sub_aperture_capture(
-    camera: RefocusCamera, scene: Scene, cells: int = 5
+    camera: RefocusCamera, scene: LayeredScene, cells: int = 5
 ) -> Float[Array, "y x"]:
     """The noise-free capture of flat layers, each part of the mask with its own view.
 
     Of the light of a point on the axis, what falls on the sensor's point Mm has come through the
     mask at m. The PSF is cut into cells × cells parts accordingly. From m a layer in front stands
     elsewhere before one behind: moved by d·m(1/t_front − 1/t_back) in the image. What it hides is
-    found for each cell, where a `Scene` takes the mean over the mask.
+    found for each cell, where a `LayeredScene` takes the mean over the mask.
     """
     thin = camera.camera
     shape, pitch = camera.field_shape, float(thin.sensor.pitch)
@@ -132,7 +132,7 @@ def scores(
     return {
         "psnr": psnr(image[inside][:, None], target[inside][:, None]),
         "ssim": ssim(image, target),
-        "ms_ssim": multiscale_ssim(align(image, target)[0], target),
+        "ms_ssim": multiscale_ssim(align(image, target), target),
     }
 
 

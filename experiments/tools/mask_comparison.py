@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from mask_captures import (
+from matplotlib.figure import Figure
+from tools.mask_captures import (
     ComparedMask,
     Setting,
     Strength,
@@ -21,7 +22,6 @@ from mask_captures import (
     strength,
     total_variation,
 )
-from matplotlib.figure import Figure
 
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table, number

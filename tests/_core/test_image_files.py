@@ -210,7 +210,7 @@ def network(path):
 
 def table(path):
     with pytest.raises(ValueError, match="holds no table of phases: holds 3000000000 bytes, at"):
-        PhaseLevels.read(path)
+        PhaseLevels.load(path)
 
 
 def calibration(path):

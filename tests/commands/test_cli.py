@@ -99,13 +99,6 @@ def test_default_folder_is_named_after_the_study(file, tmp_path, monkeypatch):
 
 
 class TestExitCode2:
-    def test_missing_file(self, tmp_path):
-        line = one_line(call("run", tmp_path / "no.yaml"))
-        assert line == f"{tmp_path / 'no.yaml'} is missing; give the path of a YAML experiment file"
-
-    def test_folder_for_a_file(self, tmp_path):
-        assert "is a folder; give the path" in one_line(call("run", tmp_path))
-
     def test_fault_in_the_file(self, file, tmp_path):
         text = file.read_text("utf-8").replace("width: 2 mm", "width: 2")
         file.write_text(text, encoding="utf-8")
@@ -125,9 +118,6 @@ class TestExitCode2:
     def test_markup_in_a_message_is_shown_as_it_is(self, file):
         assert "--set seed=[red]: " in one_line(call("run", file, "--set", "seed=[red]"))
 
-    def test_malformed_override(self, file):
-        assert one_line(call("run", file, "--set", "seed")).startswith("--set seed: write it as")
-
     def test_image_that_is_missing(self, file, tmp_path):
         out = tmp_path / "out"
         line = one_line(call("run", file, "--out", out, "--set", "targets.1.path=no.png"))
@@ -138,13 +128,6 @@ class TestExitCode2:
         file.write_text(text, encoding="utf-8")
         number = next(n for n, row in enumerate(text.split("\n"), 1) if "no.png" in row)
         assert one_line(call("run", file)).startswith(f"{file}:{number}: targets[1]: {given}")
-
-    def test_out_is_a_file(self, file, tmp_path):
-        out = tmp_path / "taken"
-        out.write_text("mine", encoding="utf-8")
-        line = one_line(call("run", file, "--out", out))
-        assert line.startswith(f"--out {out}: cannot be made a folder (")
-        assert out.read_text("utf-8") == "mine"
 
     def test_out_holds_another_study(self, file, tmp_path):
         out = tmp_path / "out"
@@ -319,21 +302,6 @@ def test_doctor_tells_what_is_missing(monkeypatch):
     assert "optional no-such-part is missing: making tea" in lines
 
 
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        (("--help",), ("run", "doctor", "thin computational cameras")),
-        (("run", "--help"), ("--out", "--set", "a.b=value", "Ctrl-C", "Experiment file")),
-        (("doctor", "--help"), ("versions", "devices")),
-    ],
-)
-def test_help(arguments, parts):
-    result = call(*arguments)
-    assert result.exit_code == 0
-    for part in parts:
-        assert part in result.stdout
-
-
 def test_help_is_in_the_order_of_use():
     listed = call("--help").stdout.partition("Commands:")[2].splitlines()
     assert [line.split()[0] for line in listed if line] == list(cli.ORDER)
@@ -403,29 +371,6 @@ def test_settings_with_which_jax_cannot_start(setting, fault, file):
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert f"{setting} ({fault}" in done.stderr.replace("JAX_PLATFORMS=cpu ", "")
     assert done.stderr.endswith("; unset it\n")
-
-
-@pytest.mark.thorough
-def test_as_a_process(file):
-    """The whole way, exit code and streams included, in the precision of a user: float32."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_ENABLE")}
-    path = os.pathsep.join(filter(None, [str(ROOT), kept.get("PYTHONPATH")]))
-    command = [
-        sys.executable,
-        "-m",
-        "thincam_jax.commands.start",
-        "run",
-        str(file),
-        "--set",
-        "mask.width=5",
-    ]
-    done = subprocess.run(
-        command, capture_output=True, text=True, env={**kept, "PYTHONPATH": path}, timeout=120
-    )
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("thincam: --set mask.width=5: mask.width: 5 has no unit")
-    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("words", [("reconstruct",), ("calibrate", "check")])

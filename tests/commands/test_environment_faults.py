@@ -20,7 +20,7 @@ from commands.sweep import mini
 
 from helpers import ROOT
 from thincam_jax.commands.interrupt import INTERRUPTED
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.measured.read import read_image
 
 pytestmark = pytest.mark.thorough
@@ -83,7 +83,7 @@ COMMANDS = [
     Command(
         "capture",
         lambda folder: [capture.write(folder)],
-        lambda out: [read_acquisition(out).frame(number).shape for number in range(6)],
+        lambda out: [Acquisition.load(out).frame(number).shape for number in range(6)],
         out="out.zarr",
         resume=("--resume",),
         begun="out.zarr/journal.jsonl",

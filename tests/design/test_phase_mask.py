@@ -25,7 +25,7 @@ from thincam_jax.design.training import TrainedSensor, Training
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.targets import siemens_star
-from thincam_jax.lensless import Path
+from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
 
@@ -50,7 +50,7 @@ def retrieved():
     """A target, and the mask of four levels that Gerchberg and Saxton's algorithm finds for it."""
     key = jax.random.key(4)
     target = contour_target(key, SENSOR.grid, feature=60 * um, line_width=8 * um)
-    path = Path(GREEN, DISTANCE)
+    path = LightPath(GREEN, DISTANCE)
     phase = retrieve_phase(target, SENSOR.grid, path, shape=(32, 36), key=key, steps=40).phase
     limits = one_turn(BLANK, GREEN, 4)
     return target, mask_of_phase(phase, BLANK, GREEN, limits), limits
@@ -166,7 +166,7 @@ def test_refinement_comes_nearer_to_the_target(retrieved):
 def test_refinement_end_to_end(retrieved):
     """Through the solver: restored images, crop and noise included, come nearer to the truth."""
     _, mask, limits = retrieved
-    images = np.stack([siemens_star((24, 24), n) for n in (6, 10)]) + 0.5
+    images = np.stack([siemens_star((24, 24), spokes=n) for n in (6, 10)]) + 0.5
     training = Training(
         images,
         setup(),

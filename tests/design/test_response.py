@@ -12,7 +12,7 @@ from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import bayes_error, channels, ring_means
 from thincam_jax.design.response import responses, seen_part
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless import Path
+from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
 from thincam_jax.reconstruction import phase_pairs
 
@@ -48,7 +48,7 @@ def test_the_exact_model_is_that_of_each_camera(profile):
     np.testing.assert_array_equal(found.whole, found.seen)
     for value, camera in zip(found.whole, design.cameras(Sensor((4, 4), 5.5e-3)), strict=True):
         u = frequencies.axis / camera.distance
-        path = Path(WAVELENGTH, camera.distance, judged.object_distance)
+        path = LightPath(WAVELENGTH, camera.distance, judged.object_distance)
         factors = jax.jit(transfer_factors)(camera.mask, path, u, u, pixel_pitch=5.5e-3)
         expected = factors.response()
         assert relative_l2(value, expected) < 1e-13
@@ -67,7 +67,7 @@ def test_without_crop_everything_is_seen():
 @pytest.mark.parametrize("object_width", [20.0, 150.0, 400.0])
 def test_seen_part_against_random_points(object_width):
     """An object smaller than the sensor's view, the thesis', and a larger; 20000 points each."""
-    judged, path = setup(object_width=object_width), Path(WAVELENGTH, 6.5, 250.0)
+    judged, path = setup(object_width=object_width), LightPath(WAVELENGTH, 6.5, 250.0)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, 20_000) * object_width
     for place in (0.0, 0.8, 1.7, 2.6, 5.0, 9.0):
         arrives = place * (1 + 6.5 / 250.0) - points * 6.5 / 250.0

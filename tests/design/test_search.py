@@ -156,19 +156,6 @@ def tiny(design, data):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"starts": 0}, "starts = 0: give a whole number from 1 to 1000"),
-        ({"samples": 0}, "samples = 0"),
-        ({"steps": -1}, "steps = -1"),
-    ],
-)
-def test_errors(options, message):
-    with pytest.raises(ValueError, match=message):
-        run(waves, jnp.asarray(DEEPEST), **options)
-
-
-@pytest.mark.parametrize(
     ("frequencies", "grid", "seeds"),
     in_full((Polar(HIGHEST, 128, 2), 161, 20), (Polar(HIGHEST, 512, 3), 321, 100)),
 )

@@ -180,19 +180,3 @@ def test_active_limits_in_words():
 def test_refused(variables, limits, message):
     with pytest.raises(ValueError, match=message):
         DesignSpace(BASE, variables, limits)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"beta": [25.0, -1.0]}, "beta"),
-        ({"distance": [6.5, 0.0]}, "distance"),
-        ({"phase": math.nan}, "phase"),
-        ({"relative_time": [1.0, 0.0]}, "relative_time"),
-        ({"beta": [25.0] * 9}, "give 1 to 8"),
-    ],
-)
-def test_designs_refused(change, message):
-    numbers = {"beta": 25.0, "phase": 0.0, "distance": 6.5, "wavelength": 500e-6, "width": 5.6}
-    with pytest.raises(ValueError, match=message):
-        Design(Exposures(**(numbers | change)))

@@ -1,20 +1,15 @@
 """Captures of masks in equal light, and the linear estimate of these."""
 
-import runpy
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tools import mask_captures as captures
 
 import thincam_jax as tc
-from helpers import ROOT
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.units import um
-
-TOOLS = SimpleNamespace(**runpy.run_path(str(ROOT / "experiments/tools/mask_captures.py")))
 
 
 @pytest.mark.thorough
@@ -22,19 +17,19 @@ def test_light_is_that_of_the_bare_sensor():
     """A white scene through a PSF of one over the field's shadow: the electrons asked for, and
     captures that share it have their parts."""
     field, plate = (24, 28), tc.FresnelZoneAperture(100.0, width=0.744)
-    setting = TOOLS.Setting(tc.Sensor((48, 56), 24 * um), 2.0, field, 0.744)
+    setting = captures.Setting(tc.Sensor((48, 56), 24 * um), 2.0, field, 0.744)
     whole = kernel_shape(setting.sensor.shape, field)
     white, key = jnp.ones((1, *field)), jax.random.key(0)
-    one = TOOLS.ComparedMask((plate,))
-    four = TOOLS.ComparedMask(4 * (plate,), synthesis="fringe_scanning")
-    seen = TOOLS.capture(setting, one, jnp.ones((1, *whole)), white, 1e4, key)
+    one = captures.ComparedMask((plate,))
+    four = captures.ComparedMask(4 * (plate,), synthesis="fringe_scanning")
+    seen = captures.capture(setting, one, jnp.ones((1, *whole)), white, 1e4, key)
     area = np.prod(field) * setting.pitch**2
     electrons = np.asarray(seen.channels[0, 0]) / area * 1e4
     np.testing.assert_allclose(electrons.mean(), 1e4, rtol=1e-3)
     np.testing.assert_allclose(electrons.var(), 1e4 + 9, rtol=0.1)
     np.testing.assert_allclose(seen.variance * (1e4 / area) ** 2, 1e4 + 9, rtol=1e-3)
     # Differences of two of four captures, each of a quarter of the light.
-    seen = TOOLS.capture(setting, four, jnp.ones((4, *whole)), white, 1e4, key)
+    seen = captures.capture(setting, four, jnp.ones((4, *whole)), white, 1e4, key)
     expected = 2 * (2500 + 9) * (area / 2500) ** 2
     np.testing.assert_allclose(seen.variance, expected, rtol=1e-3)
     np.testing.assert_allclose(np.var(seen.channels), expected, rtol=0.1)
@@ -50,8 +45,8 @@ def test_linear_estimate_solves_its_equation(key):
     images = jax.random.uniform(key, (1, *field))
     channels = jnp.stack([camera(images[:, None])[:, 0] for camera in cameras], axis=1)
     variance, (a, b) = jnp.array([1e-3]), (3.0, 0.2)
-    found = TOOLS.best_linear(
-        cameras, TOOLS.Seen(channels, variance, jnp.array([0.4])), jnp.array([[a, b]])
+    found = captures.best_linear(
+        cameras, captures.Seen(channels, variance, jnp.array([0.4])), jnp.array([[a, b]])
     )
     units = jnp.eye(56).reshape(56, 1, *field)
     matrix = np.concatenate([np.asarray(c(units)).reshape(56, -1).T for c in cameras])

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from thincam_jax.hardware import Camera, CameraSettings, Display, Stage
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
+from thincam_jax.hardware.acquisition.plan import BLACK, AcquisitionPlan, AcquisitionStep, Pattern
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.base import Frame, Identity, Region
 from thincam_jax.hardware.errors import (
@@ -220,19 +220,21 @@ class MemoryStage(MemoryDevice, Stage):
         self.play()
 
 
-def fiducial_plan(count: int, *, every: int = 5, dark_every: int = 0, stage: bool = True) -> Plan:
+def fiducial_plan(
+    count: int, *, every: int = 5, dark_every: int = 0, stage: bool = True
+) -> AcquisitionPlan:
     """Steps that show each its own number; the stage moves on after `every` of them."""
     patterns = (*(Pattern("fiducial", {"number": number}) for number in range(count)), BLACK)
     steps = []
     for number in range(count):
         place = float(number // every % 40) if stage else None
         if dark_every and number % dark_every == 0:
-            steps.append(Step(count, place, dark=True))
-        steps.append(Step(number, place))
-    return Plan("fiducials", patterns, (SETTINGS,), tuple(steps))
+            steps.append(AcquisitionStep(count, place, dark=True))
+        steps.append(AcquisitionStep(number, place))
+    return AcquisitionPlan("fiducials", patterns, (SETTINGS,), tuple(steps))
 
 
-def staying(plan: Plan) -> Plan:
+def staying(plan: AcquisitionPlan) -> AcquisitionPlan:
     """The plan with a position only where the stage moves, and none for the first steps."""
     places = [step.position for step in plan.steps]
     moves = [None, *(b if a != b else None for a, b in itertools.pairwise(places))]
@@ -240,7 +242,7 @@ def staying(plan: Plan) -> Plan:
     return replace(plan, steps=tuple(steps))
 
 
-def by_rows(plan: Plan) -> Plan:
+def by_rows(plan: AcquisitionPlan) -> AcquisitionPlan:
     """The plan, 2^n patterns of it, as one of Hadamard patterns: 16 frames share a chunk."""
     dark = sum(step.dark for step in plan.steps)
     cells = {"object_shape": [len(plan.steps) - dark, 1], "order": "natural"}
@@ -248,13 +250,13 @@ def by_rows(plan: Plan) -> Plan:
     return replace(plan, facts={"series": series})
 
 
-def picture_plan(count: int, frames: int = 4) -> Plan:
+def picture_plan(count: int, frames: int = 4) -> AcquisitionPlan:
     """Pictures on the cells, several frames of each, and dark frames among them."""
     shown = {str(number): np.full((2, 3), number, np.int32) for number in range(count // frames)}
     return pictures(shown, SETTINGS, frames=frames, dark_frames=count // 8)
 
 
-def scene_plan(count: int) -> Plan:
+def scene_plan(count: int) -> AcquisitionPlan:
     """Three exposures of one pattern, the longer ones saturated in part, and their dark frames."""
     exposures, mask = (0.01, 0.03, 0.1), Pattern("fiducial", {"number": 0})
     numbers = {"frames": count // 3, "dark_frames": count // 6}

@@ -30,26 +30,6 @@ def test_path_of_the_thesis_camera():
     assert float(camera().path(500 * nm, jnp.inf).magnification) == 1.0
 
 
-@pytest.mark.parametrize(
-    ("distance", "message"),
-    [
-        (0.0, "distance = 0.0 mm is not positive"),
-        (-6.5, "distance = -6.5 mm is not positive"),
-        (np.nan, "distance is NaN"),
-        (np.inf, "distance is infinite"),
-        (np.array([5.0, 6.5]), r"distance has shape \(2,\); give one number"),
-    ],
-)
-def test_impossible_distances(distance, message):
-    with pytest.raises(ValueError, match=message):
-        camera(distance)
-
-
-def test_a_distance_in_words_is_no_number():
-    with pytest.raises(TypeError, match="distance = '6.5 mm' is not a real number; give it in mm"):
-        camera("6.5 mm")
-
-
 def test_a_camera_is_a_tree_of_its_numbers():
     """β, φ, width, distance and pitch are leaves, so that gradients reach them through jit."""
 

@@ -167,13 +167,6 @@ def test_the_stated_snr_is_measured(key, signal_power):
         assert abs(error.mean()) < 4 * error.std() / np.sqrt(error.size)
 
 
-def test_noise_without_a_key():
-    with pytest.raises(ValueError, match="noise needs a key"):
-        tc.capture(
-            camera(), tc.Scene(plane(photograph()), 500 * nm), noise=tc.GaussianNoise(snr_db=30.0)
-        )
-
-
 @pytest.mark.parametrize("shape", [pytest.param((1, 1), marks=pytest.mark.thorough), (1, 9)])
 def test_single_pixels_and_lines(shape):
     """Every pixel is the sum of the PSF times the turned scene, written out."""

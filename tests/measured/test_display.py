@@ -1,10 +1,7 @@
-import math
-
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from thincam_jax.measured import MeasurementError, to_display
+from thincam_jax.measured import to_display
 
 
 def test_grey_values_by_the_formula():
@@ -51,19 +48,3 @@ def test_a_black_channel_and_a_black_image_stay_so():
     assert (found[..., 1] == 0).all() and (found[..., 0] == 255).all()
     assert not to_display(np.zeros((1, 4, 5))).any()
     assert to_display(jnp.ones((1, 4, 5), dtype=jnp.float32)).min() == 255
-
-
-@pytest.mark.parametrize(
-    ("image", "options", "message"),
-    [
-        (np.ones((2, 4, 5)), {}, r"shape \(2, 4, 5\) cannot be displayed"),
-        (np.full((1, 4, 5), math.nan), {}, "20 of 20 values are NaN or infinite"),
-        (np.ones((1, 4, 5)), {"gamma": 0}, "gamma = 0, percentile = 99.9"),
-        (np.ones((1, 4, 5)), {"percentile": 101}, "percentile = 101"),
-        (np.ones((1, 4, 5)), {"white_balance": (1, 1, 1)}, r"for 1 channel\(s\)"),
-        (np.ones((3, 4, 5)), {"white_balance": (1, 0, 1)}, "one finite gain above 0"),
-    ],
-)
-def test_what_is_refused(image, options, message):
-    with pytest.raises(MeasurementError, match=message):
-        to_display(image, **options)

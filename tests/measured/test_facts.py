@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from thincam_jax.commands.reconstruct.options import Sources
-from thincam_jax.commands.reconstruct.run import Rig
+from thincam_jax.commands.reconstruct.run import Inputs
 from thincam_jax.imaging.encoding import ORIENTATION, upright
 from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare, read, read_image
 from thincam_jax.measured.bayer import colour_sites, mosaic
@@ -69,9 +69,9 @@ def files(tmp_path):
 
 def test_a_dng_works_by_default(files):
     psf, capture = files
-    found = Rig(Sources(psf)).prepare(capture)
+    found = Inputs(Sources(psf)).prepare(capture)
     raws = read_image(psf), read_image(capture)
-    expected = prepare(*raws, BLACK, Preparation(bayer="BGGR"))
+    expected = prepare(*raws, background=BLACK, options=Preparation(bayer="BGGR"))
     np.testing.assert_array_equal(found.capture, expected.capture)
     np.testing.assert_array_equal(found.psf, expected.psf)
     assert (
@@ -93,23 +93,26 @@ def test_a_dng_works_by_default(files):
 def test_contradictions_are_refused_with_both_values(files, given, message):
     psf, capture = files
     with pytest.raises(MeasurementError, match=message) as caught:
-        Rig(Sources(psf, **given)).prepare(capture)
+        Inputs(Sources(psf, **given)).prepare(capture)
     assert "\n" not in str(caught.value)
 
 
 def test_what_the_messages_advise(files):
     psf, capture = files
     given = {"preparation": Preparation(bayer="BGGR"), "background": 256.0, "bits": None}
-    found = Rig(Sources(psf, **given)).prepare(capture)
-    np.testing.assert_array_equal(found.capture, Rig(Sources(psf)).prepare(capture).capture)
+    found = Inputs(Sources(psf, **given)).prepare(capture)
+    np.testing.assert_array_equal(found.capture, Inputs(Sources(psf)).prepare(capture).capture)
 
 
 def test_facts_are_not_dropped_in_python(files):
     """`prepare` takes pattern and black level of the files, and refuses what contradicts them."""
     raws = [read_image(path) for path in files]
     with pytest.raises(MeasurementError, match="black level of 256, not a dark corner"):
-        prepare(*raws, "corner")
-    found, given = prepare(*raws), prepare(*raws, BLACK, Preparation(bayer="BGGR"))
+        prepare(*raws, background="corner")
+    found, given = (
+        prepare(*raws),
+        prepare(*raws, background=BLACK, options=Preparation(bayer="BGGR")),
+    )
     assert found.capture.shape == (3, *SHAPE)
     np.testing.assert_array_equal(found.capture, given.capture)
 
@@ -118,7 +121,7 @@ def test_two_patterns(files):
     psf, capture = files
     psf.write_bytes(dng("RGGB"))
     with pytest.raises(MeasurementError, match=r"says the pattern BGGR and the PSF's .* RGGB"):
-        Rig(Sources(psf)).prepare(capture)
+        Inputs(Sources(psf)).prepare(capture)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -148,7 +151,7 @@ def test_nan_in_a_float_file_are_dead_pixels(tmp_path, caplog):
         with caplog.at_level(logging.WARNING):
             raw = read_image(tmp_path / name)
         assert f"{name}: 2 pixels are NaN or masked: taken as dead" in caplog.text
-        found = Rig(Sources(tmp_path / "psf.tif")).prepare(tmp_path / name)
+        found = Inputs(Sources(tmp_path / "psf.tif")).prepare(tmp_path / name)
         np.testing.assert_array_equal(found.valid[0], ~np.isnan(holed))
         assert found.log.capture.dead == 2
         assert not prepare(read_image(tmp_path / "psf.tif"), raw).valid.all()

@@ -11,8 +11,7 @@ from thincam_jax.design import BayesError
 from thincam_jax.design.landscape import Landscape
 from thincam_jax.design.ranking import RankedDesign
 from thincam_jax.design.sensitivity import FreeValue
-from thincam_jax.design.transfer import ModulationTransfer
-from thincam_jax.plot.design import draw_fronts, draw_mtf, draw_objective, draw_responses
+from thincam_jax.plot.design import draw_fronts, draw_objective, draw_responses
 from thincam_jax.studies.design import FoundDesigns
 
 
@@ -50,27 +49,6 @@ def test_frequencies_on_the_sensor():
     assert top.get_xlim()[1] == pytest.approx(6.25)
     assert "12.5" in top.get_xlabel()
     assert ax.lines[0].get_xdata()[0] == pytest.approx(18.75 / 128)
-
-
-@pytest.mark.thorough
-def test_contrast_side_by_side():
-    """Common axes; a curve for the chain, and one for each sum of captures."""
-    levels = np.linspace(1e-2, 1e-4, 64)
-    sums = (((1,), (2,)), ((3,), (4,)))
-    transfer = ModulationTransfer(np.stack([levels, levels / 2]), levels * 50, sums)
-    figure = draw_mtf(result(transfers=(transfer, transfer)), 100.0)
-    assert [ax.get_title() for ax in figure.axes] == ["pairs", "found 1"]
-    left, right = figure.axes
-    assert left.get_ylim() == right.get_ylim()
-    assert [line.get_label() for line in right.lines] == [
-        "camera and reconstruction",
-        "captures 1 − 2: β 20 rad/mm² at 3 mm",
-        "captures 3 − 4: β 17 rad/mm² at 3 mm",
-    ]
-    assert len({line.get_linestyle() + line.get_marker() for line in right.lines}) == 3
-    figure.draw_without_rendering()
-    assert left.child_axes[0].get_xlim()[1] == pytest.approx(0.1875)
-    assert draw_mtf(result(), 100.0) is None
 
 
 def test_fronts():

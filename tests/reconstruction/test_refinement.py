@@ -164,20 +164,6 @@ def test_slopes_are_those_of_the_misfit_by_differences(capture):
         assert found[k] == pytest.approx(wanted, rel=0.1, abs=0.02 * np.abs(found).max())
 
 
-@pytest.mark.parametrize(
-    ("settings", "advice"),
-    [
-        ({"parameters": ["sclae"]}, "give some of scale, turn, shift, blur"),
-        ({"parameters": []}, "give some of scale, turn, shift, blur"),
-        ({"search": 0.3}, "search = 0.3 is too wide; give at most 0.2"),
-    ],
-)
-def test_settings_out_of_range_are_one_line(settings, advice):
-    recording = tc.Recording(np.ones((1, 32, 40)), tc.Psfs(np.eye(9)[None]), noise_variance=1.0)
-    with pytest.raises(ValueError, match=advice):
-        tc.refine(recording, **settings)
-
-
 def test_what_cannot_be_refined_is_said():
     small = tc.Recording(np.ones((1, 20, 40)), tc.Psfs(np.eye(9)[None]))
     with pytest.raises(ValueError, match="give at least 32 a side"):

@@ -194,8 +194,3 @@ def test_float32_stays_float32_and_gradients_are_the_transpose():
     assert jax.jit(Cosines().analyse)(image).dtype == jnp.float32
     _, pull = jax.vjp(analyse, image)
     np.testing.assert_allclose(pull(image)[0], synthesise(image), atol=1e-5)
-
-
-def test_wrong_levels_are_refused():
-    with pytest.raises(ValueError, match="at least 1"):
-        Wavelet("haar", 0)

@@ -22,7 +22,7 @@ def test_a_white_monitor_is_1_where_it_is_brightest():
     system = monitor_system(study.camera, study.plane, 2)
     white = system(jnp.ones(study.plane.shape, system.values.dtype))
     assert float(jnp.max(white)) == pytest.approx(1)
-    elsewhere = wg.ObjectPlane(study.plane.shape, 550.0, 120.0, (0.0, 9000.0))
+    elsewhere = wg.ObjectPlane(study.plane.shape, 550.0, 120.0, (9000.0, 0.0))
     with pytest.raises(ValueError, match="no light from the monitor reaches the sensor"):
         monitor_system(study.camera, elsewhere, 2)
 

@@ -111,7 +111,7 @@ def right(study):
 def test_mistakes_are_those_of_the_thesis(study, right, mistake, on_axis):
     """All but the ghost index agree on the axis, and none elsewhere."""
     wrong = mistaken_rays(study, study.camera, mistake)
-    moved = np.mean(wrong.points - right.points, axis=-2)[..., 1]
+    moved = np.mean(wrong.points - right.points, axis=-2)[..., 0]
     rows, columns = study.camera.sensor.shape
     middle = moved[:, rows // 2 - 1 : rows // 2 + 1, columns // 2 - 1 : columns // 2 + 1].mean(
         (1, 2)

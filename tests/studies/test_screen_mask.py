@@ -15,7 +15,7 @@ from thincam_jax.studies.screen_calibration import CalibrationRun
 from thincam_jax.studies.screen_mask import ScreenMask, first_image
 from thincam_jax.waveguide.screen_to_sensor import ghost_images
 
-PLANE = wg.ObjectPlane((18, 24), OBJECT, 150.0, (6.0, 12.0))
+PLANE = wg.ObjectPlane((18, 24), OBJECT, 150.0, (12.0, 6.0))
 
 
 def test_cells_are_carried_to_their_first_image():
@@ -23,13 +23,15 @@ def test_cells_are_carried_to_their_first_image():
     camera = behind()
     matrix, field = first_image(camera, PLANE)
     rows, columns = np.mgrid[: PLANE.shape[0], : PLANE.shape[1]]
-    x, y = ((n - (c - 1) / 2) * float(PLANE.pitch) for n, c in ((columns, 24), (rows, 18)))
+    y, x = ((n - (c - 1) / 2) * float(PLANE.pitch) for n, c in ((rows, 18), (columns, 24)))
     ends = [(n - 1) / 2 * float(camera.sensor.pitch) for n in field]
     v, u = np.meshgrid(*(np.linspace(-e, e, n) for e, n in zip(ends, field, strict=True)))
-    pixels = jnp.asarray(np.stack([v, u], axis=-1).transpose(1, 0, 2)[..., ::-1])
-    seen = np.asarray(wg.trace(camera, pixels, OBJECT, 1).points)[0, ..., :2]
-    inside = np.abs(seen - np.asarray(PLANE.centre)) < np.array([62.0, 43.0])
-    for axis, place in enumerate((x, y)):
+    pixels = jnp.asarray(np.stack([v, u], axis=-1).transpose(1, 0, 2))
+    seen = np.asarray(wg.trace(camera, pixels, object_distance=OBJECT, orders=1).points)[
+        0, ..., 1::-1
+    ]
+    inside = np.abs(seen - np.asarray(PLANE.centre)) < np.array([43.0, 62.0])
+    for axis, place in enumerate((y, x)):
         found = (matrix @ place.ravel()).reshape(field) + float(PLANE.centre[axis])
         assert np.abs(found - seen[..., axis])[inside.all(axis=-1)].max() < 0.1 * float(PLANE.pitch)
     assert float(matrix.sum(axis=0).min()) > 0.3 * float(matrix.sum(axis=0).max())
@@ -37,10 +39,10 @@ def test_cells_are_carried_to_their_first_image():
 
 @pytest.mark.thorough
 def test_matrix_against_rays_through_every_part_of_the_mask():
-    camera, plane = behind(), wg.ObjectPlane((54, 72), OBJECT, 150.0, (6.0, 12.0))
-    middle, sides = np.asarray(plane.centre), np.array(plane.shape)[::-1]
-    x, y = (float(plane.pitch) * (np.arange(n) - (n - 1) / 2) for n in sides)
-    image = blobs(np.stack(np.meshgrid(x, y), axis=-1) + middle)
+    camera, plane = behind(), wg.ObjectPlane((54, 72), OBJECT, 150.0, (12.0, 6.0))
+    middle, sides = np.asarray(plane.centre), np.array(plane.shape)
+    y, x = (float(plane.pitch) * (np.arange(n) - (n - 1) / 2) for n in sides)
+    image = blobs(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1) + middle)
 
     def scene(points):
         half = sides * float(plane.pitch) / 2

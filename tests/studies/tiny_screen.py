@@ -34,7 +34,7 @@ def camera(wavelength: float = 532 * nm, tilt: Any = None) -> wg.SeeThroughCamer
     hologram = wg.VolumeHologram.record(
         wavelength, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
     )
-    bottom = wg.Rectangle(jnp.asarray([0.0, 25.0]), jnp.asarray([400.0, 50.0]))
+    bottom = wg.Rectangle(jnp.asarray([25.0, 0.0]), jnp.asarray([50.0, 400.0]))
     screen = wg.Screen(hologram, 5.0, 1.5, bottom=bottom)
     return wg.SeeThroughCamera(screen, tc.Sensor((22, 30), 70.4 * um), 6.0, 10.0, tilt=tilt)
 
@@ -47,7 +47,7 @@ def study(*cameras: wg.SeeThroughCamera, **changed: Any) -> ScreenStudy:
     targets = {"star": (star > star.mean()).astype(float), "camera": resize(photograph, CELLS)}
     fields: dict[str, Any] = {
         "cameras": cameras or (camera(),),
-        "plane": wg.ObjectPlane(CELLS, 550.0, 120.0, jnp.asarray([0.0, 27.0])),
+        "plane": wg.ObjectPlane(CELLS, 550.0, 120.0, jnp.asarray([27.0, 0.0])),
         "targets": targets,
         "noise": tc.GaussianNoise(40.0),
         "solvers": {"CGM": tc.Ridge(1.0), "smooth": tc.Ridge(3.0)},

@@ -44,7 +44,7 @@ def camera(films=None, sensor=None, responses=None, bottom=None, **others):
 
 
 def plane(shape=(12, 16)):
-    return wg.ObjectPlane(shape, DISTANCE, 160.0, (0.0, 27.0))
+    return wg.ObjectPlane(shape, DISTANCE, 160.0, (27.0, 0.0))
 
 
 def coupled_waves(first, second, wavelength, modulation):
@@ -129,7 +129,7 @@ def summed(camera, films, pixel, picture, orders, crossed=True):
     `picture`: for each primary rows and columns of cells, whose product is its radiance.
     """
     wave = np.arange(400, 720, 0.02) * nm
-    slope = -np.asarray(pixel) / PINHOLE
+    slope = -np.asarray(pixel)[::-1] / PINHOLE
     t = slope / np.sqrt(1 + slope @ slope)
     K = [np.asarray(film.grating) for film in films]
     numbers = range(len(K))
@@ -197,10 +197,10 @@ def test_a_plan_says_whether_cross_talk_matters():
     sensor, picture = tc.Sensor((16, 12), 130 * um), sample_image("astronaut", linear=True)
     picture = np.moveaxis(resize(picture, (12, 16)), -1, 0)
     lit = LitPlane(plane(), picture)
-    edge = wg.Rectangle((0.0, 20.0), (400.0, 40.0))
+    edge = wg.Rectangle((20.0, 0.0), (40.0, 400.0))
     for width, tolerance, crosstalk in ((70 * nm, 3e-3, "all"), (30 * nm, 0.3, "none")):
         both = camera(sensor=sensor, responses=bands(width), bottom=edge)
-        plan = wg.plan(both, lit, tolerance=tolerance)
+        plan = wg.plan_screen(both, lit, tolerance=tolerance)
         counts = 4, 32, "all", plan.level  # the bottom hologram ends after three
         exact = colour_system(both, plan.plane, *counts)(jnp.asarray(picture)[:, None])
         found = plan.system()(jnp.asarray(picture, plan.precision)[:, None])
@@ -209,4 +209,4 @@ def test_a_plan_says_whether_cross_talk_matters():
         assert plan.meets_tolerance and plan.crosstalk == crosstalk
         assert f"cross-talk  {crosstalk}: " in str(plan)
     with pytest.raises(ValueError, match=r"images are .*12, 16.*; give \(3, 'y', 'x'\), of one"):
-        wg.plan(both, LitPlane(plane(), picture[0]), tolerance=0.1)
+        wg.plan_screen(both, LitPlane(plane(), picture[0]), tolerance=0.1)

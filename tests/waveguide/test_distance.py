@@ -32,7 +32,7 @@ def clean(image, distance, width=1.5):
     """Its capture, of the same angular size at all distances; wider than the field it fills it."""
     field = 0.352 * (10 + distance)
     below = max(0.5 * field * (width - 1.06), 0)
-    plane = wg.ObjectPlane(image.shape, distance, field * width, (0.0, 9.1 + below))
+    plane = wg.ObjectPlane(image.shape, distance, field * width, (9.1 + below, 0.0))
     return np.asarray(wg.system_operator(through(), plane)(jnp.asarray(image)), float)
 
 

@@ -39,13 +39,13 @@ GRAZING = np.arcsin(np.sin(89.9 * deg) / 1.5)
 MET = 10.0 * np.tan(89.9 * deg) + 5.0 * np.tan(GRAZING)
 
 # name: (camera, pixel, object distance), bounds of the points in float32 and float64, status.
-BESIDE, MIDDLE = (0.0, -6.0 * np.tan(89.9 * deg)), (0.0, 0.0)
-OBLIQUE = (0.0, -6.0 * np.tan(np.arcsin(1.5 * np.sin(10.0 * deg))))
+BESIDE, MIDDLE = (-6.0 * np.tan(89.9 * deg), 0.0), (0.0, 0.0)
+OBLIQUE = (-6.0 * np.tan(np.arcsin(1.5 * np.sin(10.0 * deg))), 0.0)
 
 EXTREMES = {
     "the default": (case(), 3e-7, 1.2e-15, 0),
     "in air at 89.9°": (
-        case(recorded(60.0, GRAZING), pixel=BESIDE, top=wg.Rectangle((0.0, MET), (2.0, 2.0))),
+        case(recorded(60.0, GRAZING), pixel=BESIDE, top=wg.Rectangle((MET, 0.0), (2.0, 2.0))),
         3e-7,
         1.2e-15,
         0,
@@ -87,7 +87,7 @@ def exact(sts, pixel, distance, orders=4):
         def number(value):
             return mpmath.mpf(float(value))
 
-        x, y = (number(p) for p in pixel)
+        y, x = (number(p) for p in pixel)
         film = sts.screen.hologram
         fringes = mpmath.matrix([number(k) for k in film.grating])
         index, glass = number(film.index.value), number(sts.screen.glass_index.value)
@@ -118,7 +118,7 @@ def error(name, dtype):
     """Largest error of the points over all orders, relative to the farthest of them."""
     given = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), EXTREMES[name][0])
     sts, pixel, distance = given
-    rays = wg.trace(sts, jnp.stack(pixel), distance, 4)
+    rays = wg.trace(sts, jnp.stack(pixel), object_distance=distance, orders=4)
     expected = exact(*given)
     found = np.asarray(rays.points[..., :2], float)
     assert np.isfinite(found).all() and np.isfinite(np.asarray(rays.weight)).all()
@@ -154,7 +154,7 @@ def test_no_fringes(dtype):
     """K = 0 matches nothing; the points are finite and dark all the same."""
     given = jax.tree.map(lambda leaf: jnp.asarray(leaf, DTYPES[dtype]), case(weak(0.0)))
     sts, pixel, distance = given
-    rays = wg.trace(sts, jnp.stack(pixel), distance, 2)
+    rays = wg.trace(sts, jnp.stack(pixel), object_distance=distance, orders=2)
     assert (rays.status == RayStatus.NO_BRAGG_MATCH).all()
     assert np.isfinite(rays.points).all() and not rays.weight.any()
     band = trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)
@@ -171,12 +171,12 @@ def test_no_fringes(dtype):
         ),
         ({"film": weak(0.0)}, "diffracts no wavelength of its index's band back"),
         (
-            {"bottom": wg.Rectangle((0.0, 9.0), (20.0, 15.0))},
-            r"bottom.size = \(20, 15\) mm is smaller than one bounce .*, \(0, 18.19\) mm",
+            {"bottom": wg.Rectangle((9.0, 0.0), (15.0, 20.0))},
+            r"bottom.size = \(15, 20\) mm is smaller than one bounce .*, \(18.19, 0\) mm",
         ),
     ],
 )
 def test_screens_that_show_nothing_are_refused(screen, message):
     with pytest.raises(ValueError, match=message):
         wg.check_screen(camera(**screen))
-    wg.check_screen(camera(bottom=wg.Rectangle((0.0, 30.0), (20.0, 50.0))))
+    wg.check_screen(camera(bottom=wg.Rectangle((30.0, 0.0), (50.0, 20.0))))

@@ -84,17 +84,17 @@ def random_case(random):
         screen = wg.Screen(film, width, film.index)
         sts = wg.SeeThroughCamera(screen, sensor, focal, random.uniform(2, 20))
         distance = np.exp(random.uniform(np.log(100), np.log(2000)))
-        middle = wg.trace(sts, jnp.zeros(2), distance, 1)
+        middle = wg.trace(sts, jnp.zeros(2), object_distance=distance, orders=1)
         if int(middle.status[0]) != RayStatus.OK:
             continue
         # The bottom hologram: of any length, or of all that matters.
         first = float(middle.points[0, 1])
         height = random.uniform(1, 6) * first + 80 * field if random.uniform() < 0.5 else 1e4
-        bottom = wg.Rectangle((0.0, first), (200.0, height))
+        bottom = wg.Rectangle((first, 0.0), (height, 200.0))
         sts = eqx.tree_at(lambda c: c.screen.bottom, sts, bottom, is_leaf=lambda n: n is None)
         seen = 2 * field * distance
         offset = random.uniform(-0.2, 0.2, 2) * seen
-        centre = np.asarray(middle.points[0, :2]) + offset
+        centre = np.asarray(middle.points[0, 1::-1]) + offset[::-1]
         plane = wg.ObjectPlane(CELLS, distance, random.uniform(0.3, 1.3) * seen, centre)
         image = pictures()[random.integers(5)]
         return sts, LitPlane(plane, image), 10 ** random.uniform(-3.5, -0.5)
@@ -106,7 +106,7 @@ def test_predictions_hold_over_random_cameras(capsys, count, seed):
     random, pairs, met, kinds = np.random.default_rng(seed), [], [], []
     for _ in range(count):
         sts, scene, tolerance = random_case(random)
-        plan = wg.plan(sts, scene, tolerance=tolerance)
+        plan = wg.plan_screen(sts, scene, tolerance=tolerance)
         pairs.append(errors(plan, scene))
         met.append((plan.meets_tolerance, pairs[-1][1] <= tolerance))
         way = (not plan.field_dependent, plan.dispersion, plan.samples is not None)
@@ -130,7 +130,7 @@ def test_predictions_hold_over_random_cameras(capsys, count, seed):
 
 
 def lit(shape):
-    return LitPlane(wg.ObjectPlane(shape, 550.0, 150.0, (0.0, 27.0)), np.ones(shape))
+    return LitPlane(wg.ObjectPlane(shape, 550.0, 150.0, (27.0, 0.0)), np.ones(shape))
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def thin(glass, modulation=0.02):
 @pytest.mark.thorough
 def test_what_a_scene_requires(scene):
     """A loose tolerance takes rows and columns apart, a strict one the whole band of all ghosts."""
-    loose, strict = (wg.plan(thin(5.0), scene, tolerance=t) for t in (0.2, 1e-3))
+    loose, strict = (wg.plan_screen(thin(5.0), scene, tolerance=t) for t in (0.2, 1e-3))
     assert loose.meets_tolerance and strict.meets_tolerance
     assert isinstance(loose.system(), Separable) and isinstance(strict.system(), Sparse)
     assert loose.orders < strict.orders
@@ -164,8 +164,8 @@ def test_what_a_scene_requires(scene):
 @pytest.mark.thorough
 @pytest.mark.parametrize("tolerance", [0.03, 1e-3])
 def test_the_light_of_several_planes_adds_up(scene, tolerance):
-    near = LitPlane(wg.ObjectPlane(CELLS, 250.0, 80.0, (5.0, 27.0)), pictures()[3])
-    plan = wg.plan(thin(5.0), [scene, near], tolerance=tolerance)
+    near = LitPlane(wg.ObjectPlane(CELLS, 250.0, 80.0, (27.0, 5.0)), pictures()[3])
+    plan = wg.plan_screen(thin(5.0), [scene, near], tolerance=tolerance)
     predicted, true = errors(plan, scene, near)
     assert true <= predicted <= min(tolerance, 5 * true)
 
@@ -173,10 +173,8 @@ def test_the_light_of_several_planes_adds_up(scene, tolerance):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"tolerance": 0.0}, ValueError, "tolerance = 0.0 is not positive"),
         ({"scene": [lit((3, 4)), lit((4, 3))]}, ValueError, "planes have .* cells; give at least"),
         ({"scene": []}, ValueError, "planes have .* cells; give at least one"),
-        ({"tolerance": 3.0}, ValueError, "tolerance = 3 is relative: give at most 1"),
         pytest.param(
             *({"camera": thin(5.0, 0.0)}, ValueError, "no light reaches the sensor.*check_screen"),
             marks=pytest.mark.thorough,
@@ -186,9 +184,9 @@ def test_the_light_of_several_planes_adds_up(scene, tolerance):
 def test_errors(scene, change, error, message):
     given = {"camera": thin(5.0), "scene": scene, "tolerance": 0.1} | change
     with pytest.raises(error, match=message):
-        wg.plan(given["camera"], given["scene"], tolerance=given["tolerance"])
+        wg.plan_screen(given["camera"], given["scene"], tolerance=given["tolerance"])
 
 
 def test_a_dark_image_is_refused():
     with pytest.raises(ValueError, match="image is dark, and errors are relative"):
-        LitPlane(wg.ObjectPlane(CELLS, 550.0, 150.0, (0.0, 27.0)), np.zeros(CELLS))
+        LitPlane(wg.ObjectPlane(CELLS, 550.0, 150.0, (27.0, 0.0)), np.zeros(CELLS))

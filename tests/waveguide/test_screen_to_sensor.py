@@ -26,13 +26,13 @@ def behind(shape=(28, 32), pitch=110 * um):
 
 class TestGhostImages:
     def images(self):
-        field = jnp.array([[0.0, 0.0], [0.6, 0.9], [-1.05, -0.4]])
+        field = jnp.array([[0.0, 0.0], [0.9, 0.6], [-0.4, -1.05]])
         return ghost_images(behind(), field, OBJECT, ORDERS)
 
     @pytest.mark.thorough
     def test_all_orders_see_the_same_point(self):
         found = self.images()
-        rays = wg.trace(behind(), found.places, OBJECT, ORDERS)
+        rays = wg.trace(behind(), found.places, object_distance=OBJECT, orders=ORDERS)
         points = np.asarray(rays.points)
         for order in range(ORDERS):
             np.testing.assert_allclose(points[order, order], points[0, 0], atol=1e-9)
@@ -45,8 +45,10 @@ class TestGhostImages:
         One pixel sees points 18.19 mm apart, 32 mrad at the first image's 567 mm. But the ghost of
         one point is farther away: d1 + d2 + 2w/n + 3w/(n cos²Θ') = 600 mm along the screen.
         """
-        y = np.asarray(self.images().places)[:, 0, 1]
-        apart = np.asarray(wg.trace(behind(), jnp.zeros((1, 2)), OBJECT, 2).points)[:, 0, 1]
+        y = np.asarray(self.images().places)[:, 0, 0]
+        apart = np.asarray(
+            wg.trace(behind(), jnp.zeros((1, 2)), object_distance=OBJECT, orders=2).points
+        )[:, 0, 1]
         assert apart[1] - apart[0] == pytest.approx(2 * 5 * np.tan(np.deg2rad(61.2)), rel=1e-6)
         assert (apart[1] - apart[0]) / 567 * 1e3 == pytest.approx(32.1, abs=0.1)
         assert (y[1] - y[0]) / 6.5 * 1e3 == pytest.approx(30.38, abs=0.01)
@@ -109,15 +111,17 @@ def traced(camera, scene):
     rows, columns = camera.sensor.shape
     lattice = tc.Grid((fine * (rows - 1) + across, fine * (columns - 1) + across), pitch)
     y, x = np.meshgrid(lattice.y, lattice.x, indexing="ij")
-    rays = wg.trace(camera, jnp.asarray(np.stack([x, y], axis=-1)), OBJECT, ORDERS)
-    points, weights = np.asarray(rays.points)[..., :2], np.asarray(rays.weight)
+    rays = wg.trace(
+        camera, jnp.asarray(np.stack([y, x], axis=-1)), object_distance=OBJECT, orders=ORDERS
+    )
+    points, weights = np.asarray(rays.points)[..., 1::-1], np.asarray(rays.weight)
     places = (np.arange(across) - (across - 1) / 2) * pitch
     total = np.zeros((rows, columns))
     for row, column in np.argwhere(opened > 0):
         # The mask's first part leaves the lattice's last differences.
         down, right = across - 1 - row, across - 1 - column
         part = np.s_[:, down : down + fine * rows : fine, right : right + fine * columns : fine]
-        seen = scene(points[part] + places[[column, row]])
+        seen = scene(points[part] + places[[row, column]])
         total += opened[row, column] * np.sum(weights[part] * seen, axis=0)
     return total * pitch**2
 
@@ -126,7 +130,7 @@ def blobs(points):
     """Three spots on the object, mm."""
     total = np.full(points.shape[:-1], 0.0)
     for x, y, size in ((-30, 10, 9), (25, -20, 12), (10, 45, 8)):
-        total += np.exp(-np.sum((points - [x, y]) ** 2, axis=-1) / (2 * size**2))
+        total += np.exp(-np.sum((points - [y, x]) ** 2, axis=-1) / (2 * size**2))
     return total
 
 
@@ -134,7 +138,7 @@ def field_of(camera, shape, count):
     """The first images of `count` points of a field, from its first to its last sample."""
     half = [(n - 1) / 2 * float(camera.sensor.pitch) for n in shape]
     y, x = (np.linspace(-h, h, n) for h, n in zip(half, count, strict=True))
-    return jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1))
+    return jnp.asarray(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1))
 
 
 @pytest.mark.thorough
@@ -158,7 +162,9 @@ def test_operator_against_rays_through_every_part_of_the_mask():
     images = ghost_images(camera, field_of(camera, shape, (5, 5)), OBJECT, ORDERS)
     psfs = ghost_psfs(images, shadow)
     fit = low_rank_psf(psfs, camera.sensor.pitch, camera.sensor.shape, shape, tolerance=2e-3)
-    points = wg.trace(camera, field_of(camera, shape, shape), OBJECT, 1).points[0, ..., :2]
+    points = wg.trace(
+        camera, field_of(camera, shape, shape), object_distance=OBJECT, orders=1
+    ).points[0, ..., 1::-1]
     scene = jnp.asarray(blobs(np.asarray(points)))
     expected = traced(camera, blobs)
     assert relative_l2(fit.operator(scene), expected) < 0.01

@@ -15,18 +15,18 @@ from thincam_jax.waveguide.efficiency import diffraction_efficiency
 from thincam_jax.waveguide.rays import pixel_centres
 from thincam_jax.waveguide.smear import trace_band
 
-PIXELS = [(0.0, 0.0), (0.0, 1.0536), (-1.0536, -1.0536)]
+PIXELS = [(0.0, 0.0), (1.0536, 0.0), (-1.0536, -1.0536)]
 
 
 def one_wavelength(pixel, order, wavelength, index, distance=550.0, width=5.0):
-    """(x, y) on the object by wave vectors: the tangential one is kept, the medium sets its length.
+    """(y, x) on the object by wave vectors: the tangential one is kept, the medium sets its length.
 
     At each hologram K is taken from the wave vector and z follows from the wavenumber, for every
     wavelength, so that nothing is known of the Bragg condition.
     """
     fringes = 2 * np.pi * 1.5 / 532e-6 * np.array([-np.sin(np.radians(61.2))])
     wavenumber = 2 * np.pi / wavelength
-    ray = -np.array([*pixel]) / np.hypot(np.hypot(*pixel), 6.0)
+    ray = -np.array([*pixel])[::-1] / np.hypot(np.hypot(*pixel), 6.0)
 
     def gone(tangential, medium, depth):
         length = medium * wavenumber
@@ -38,7 +38,8 @@ def one_wavelength(pixel, order, wavelength, index, distance=550.0, width=5.0):
         return None
     place = gone(outside, 1.0, 10.0) + gone(outside, index, width)
     place = place + (2 * order + 1) * gone(guided, index, width)
-    return place + gone(outside, index, width) + gone(outside, 1.0, distance)
+    place = place + gone(outside, index, width) + gone(outside, 1.0, distance)
+    return place[::-1]
 
 
 efficiency = eqx.filter_jit(diffraction_efficiency)
@@ -62,7 +63,7 @@ def test_parts_of_the_band(number):
     sts, film, pixel = camera(), hologram(), PIXELS[number]
     samples = 10
     rays = trace_band(sts, jnp.asarray(pixel), 550.0, 3, samples)
-    across = -np.array(pixel) / np.hypot(np.hypot(*pixel), 6.0)
+    across = -np.array(pixel)[::-1] / np.hypot(np.hypot(*pixel), 6.0)
     centre = float(film.bragg_wavelength(jnp.asarray(across))[0])
     wavelengths = centre + np.linspace(-80, 80, 4001) * nm
     lights_there = lights(across, wavelengths, 3)
@@ -80,7 +81,7 @@ def test_parts_of_the_band(number):
         part = np.minimum(np.cumsum(light) / light.sum() * samples, samples - 1e-9).astype(int)
         means = np.stack([np.average(places[part == k], 0, light[part == k]) for k in range(10)])
         ours = np.asarray(rays.points[order])
-        ours = ours[np.argsort(ours[:, 1])]
+        ours = ours[np.argsort(ours[:, 0])]
         np.testing.assert_allclose(ours[1:-1], means[1:-1], atol=0.03 * (2 * order + 1))
 
 
@@ -90,9 +91,12 @@ def test_the_bragg_wavelength_alone():
     pixels = jnp.asarray(PIXELS)
     narrow = camera(hologram(thickness=16.0, index_modulation=2e-5))
     narrow = eqx.tree_at(lambda c: c.tilt, narrow, jnp.array([0.03, -0.05]))
-    rays, band = wg.trace(narrow, pixels, 550.0, 2), trace_band(narrow, pixels, 550.0, 2, 4)
+    rays, band = (
+        wg.trace(narrow, pixels, object_distance=550.0, orders=2),
+        trace_band(narrow, pixels, 550.0, 2, 4),
+    )
     np.testing.assert_allclose(band.weight, rays.weight, rtol=1e-2)
-    spread = np.abs(np.asarray(band.points) - np.asarray(rays.points)[..., None, :2])
+    spread = np.abs(np.asarray(band.points) - np.asarray(rays.points)[..., None, 1::-1])
     assert spread.max() < 0.02
 
 
@@ -101,15 +105,15 @@ def test_holograms_and_critical_angle_cut_the_band():
     """At its edge a hologram keeps a part of a contact's band, and the later contacts their own."""
     pixel = jnp.zeros((1, 2))
     whole = trace_band(camera(), pixel, 550.0, 3, 4)
-    edge = float(wg.trace(camera(), pixel, 550.0, 3).points[1, 0, 1])
-    half = wg.Rectangle((0.0, edge / 2), (10.0, edge))
+    edge = float(wg.trace(camera(), pixel, object_distance=550.0, orders=3).points[1, 0, 1])
+    half = wg.Rectangle((edge / 2, 0.0), (edge, 10.0))
     cut = trace_band(camera(bottom=half), pixel, 550.0, 3, 4)
     np.testing.assert_allclose(cut.weight[0], whole.weight[0], rtol=1e-12)
     assert 0.3 < float(cut.weight[1, 0] / whole.weight[1, 0]) < 0.7
-    assert float(cut.points[1, ..., 1].max()) < edge + 0.01
+    assert float(cut.points[1, ..., 0].max()) < edge + 0.01
     assert not cut.weight[2].any()
     # −29.87° is the critical angle of the Bragg wavelength: half of the band is still guided there.
-    steep = jnp.array([[0.0, 6.0 * np.tan(np.radians(29.87))]])
+    steep = jnp.array([[6.0 * np.tan(np.radians(29.87)), 0.0]])
     part = trace_band(camera(), steep, 550.0, 3, 4)
     assert 0.3 < float(part.weight[0, 0]) / 4.9e-6 < 0.8
 
@@ -119,9 +123,9 @@ def test_a_capture_is_the_sum_over_the_band():
     """Against 101 wavelengths of a coarse sensor, cells averaged by many points."""
     sensor = tc.Sensor((5, 6), 360 * um)
     sts = wg.SeeThroughCamera(wg.Screen(hologram(), 5.0, 1.5), sensor, 6.0, 10.0)
-    plane = wg.ObjectPlane((20, 16), 550.0, 160.0, (0.0, 27.0))
+    plane = wg.ObjectPlane((20, 16), 550.0, 160.0, (27.0, 0.0))
     image = np.random.default_rng(4).uniform(size=plane.shape)
-    operator = wg.system_operator(sts, plane, 2, samples=20)
+    operator = wg.system_operator(sts, plane, orders=2, samples=20)
     assert adjoint_error(operator, jax.random.key(1)) < 1e-14
     film, expected, level = hologram(), np.zeros(sensor.shape), 0.0
     pixels = np.asarray(pixel_centres(sts))
@@ -129,7 +133,7 @@ def test_a_capture_is_the_sum_over_the_band():
     offsets = (np.arange(60) + 0.5) / 60 * size - size / 2
     for row, column in np.ndindex(*sensor.shape):
         pixel = pixels[row, column]
-        across = jnp.asarray(-pixel / np.hypot(np.hypot(*pixel), 6.0))
+        across = jnp.asarray(-pixel[::-1] / np.hypot(np.hypot(*pixel), 6.0))
         centre = float(film.bragg_wavelength(across)[0])
         wavelengths = centre + np.linspace(-25, 25, 101) * nm
         eta = lights(across, wavelengths, 2)
@@ -139,8 +143,8 @@ def test_a_capture_is_the_sum_over_the_band():
                 place = one_wavelength(pixel, order, wavelength, 1.5)
                 if place is None or light < 1e-4:
                     continue
-                columns = np.floor((place[0] + offsets) / 10 + 8).astype(int)
-                rows = np.floor((place[1] - 27 + offsets) / 10 + 10).astype(int)
+                columns = np.floor((place[1] + offsets) / 10 + 8).astype(int)
+                rows = np.floor((place[0] - 27 + offsets) / 10 + 10).astype(int)
                 columns = columns[(columns >= 0) & (columns < 16)]
                 rows = rows[(rows >= 0) & (rows < 20)]
                 expected[row, column] += light * image[np.ix_(rows, columns)].sum() / 3600

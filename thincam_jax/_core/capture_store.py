@@ -117,7 +117,7 @@ class CaptureStore:
 
     def __init__(self, path: Path, mode: str = "r", kinds: Sequence[str] = (CALIBRATION, CAPTURES)):
         self.path, self._chunks = path, path / "frames" / "c"
-        wanted = f"store of {kinds[-1]}", "an acquisition or create_captures"
+        wanted = f"store of {kinds[-1]}", "an acquisition or HadamardCaptures.create"
         with opened(path, kinds, wanted, mode) as (self.group, self.attributes):
             # A chunk of black frames is written, too: one that is not there is missing.
             dtype, shape = dtype_of_bits(self.attributes["bits"]), self.attributes["sensor_shape"]

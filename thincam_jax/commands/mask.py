@@ -25,7 +25,7 @@ from thincam_jax.lensless.masks.pinhole import Pinhole
 from thincam_jax.lensless.masks.redundant_arrays import ModifiedUniformlyRedundantArray
 from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
 from thincam_jax.lensless.masks.sampled import SampledMask, read_mask
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 
@@ -70,7 +70,7 @@ def _phases(path: str, width: float) -> SampledMask:
 
 
 def _contours(
-    key: int, blank: MaskBlank, light: Path, *, feature: float, line_width: float
+    key: int, blank: MaskBlank, light: LightPath, *, feature: float, line_width: float
 ) -> PhaseMask:
     from thincam_jax.design.phase_mask import contour_mask  # slow, and not needed by other masks
 
@@ -189,7 +189,7 @@ def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
     """
     names = ("beta", "phase", "width", "wavelength", "distance")
     numbers = dict(config) | {name: getattr(exposure, name) for name in names}
-    numbers |= {"key": config.seed or 0, "light": Path(exposure.wavelength, exposure.distance)}
+    numbers |= {"key": config.seed or 0, "light": LightPath(exposure.wavelength, exposure.distance)}
     maker = FAMILIES[config.family]
     parameters = inspect.signature(maker).parameters
     if "blank" in parameters:

@@ -34,7 +34,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.precision import as_complex, squared_modulus
 from thincam_jax.design.design import Design
-from thincam_jax.design.training import Channel, Training, channels_of, relative_error
+from thincam_jax.design.training import CaptureSum, Training, channels_of, relative_error
 from thincam_jax.reconstruction.problem import brightness
 
 Image = Float[Array, "v u"]
@@ -65,7 +65,7 @@ def restore(design: Design, training: Training) -> Float[Array, "image v u"]:
     return restore_by(channels_of(design, training), training)
 
 
-def restore_by(cameras: tuple[Channel, ...], training: Training) -> Float[Array, "image v u"]:
+def restore_by(cameras: tuple[CaptureSum, ...], training: Training) -> Float[Array, "image v u"]:
     """Images restored from captures of any cameras, one for each row of a training's synthesis."""
 
     def one(image, noise):
@@ -82,7 +82,7 @@ def restore_by(cameras: tuple[Channel, ...], training: Training) -> Float[Array,
 class _Captures:
     """(capture, variance) of each camera, one image's."""
 
-    def __init__(self, cameras: Sequence[Channel], measured: Sequence[Any], training: Training):
+    def __init__(self, cameras: Sequence[CaptureSum], measured: Sequence[Any], training: Training):
         self.cameras, self.variances = cameras, [variance for _, variance in measured]
         self.training, self.image = training, training.images[0]
         self.right = self._back([capture for capture, _ in measured])

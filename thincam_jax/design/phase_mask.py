@@ -36,14 +36,14 @@ from thincam_jax.design.objectives import Channels, bayes_error
 from thincam_jax.design.phase_retrieval import contour_target, match_error, retrieve_phase
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.stochastic import adam
-from thincam_jax.design.training import Channel, relative_error
+from thincam_jax.design.training import CaptureSum, relative_error
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.sampling import require_phase_sampling
 
 # Of the angle u, whose range from the lowest to the highest relief is π/2.
@@ -121,7 +121,7 @@ def mask_of_phase(
 
 @checked
 def contour_mask(
-    key: Key, blank: MaskBlank, path: Path, *, feature: Number, line_width: Number
+    key: Key, blank: MaskBlank, path: LightPath, *, feature: Number, line_width: Number
 ) -> PhaseMask:
     """The mask whose PSF at a path's wavelength and distances is nearest to a `contour_target`.
 
@@ -132,10 +132,10 @@ def contour_mask(
     ```python
     import thincam_jax as tc
     from thincam_jax.design.phase_mask import contour_mask
-    from thincam_jax.lensless.propagation.path import Path
+    from thincam_jax.lensless.propagation.path import LightPath
 
     blank = tc.lensless.masks.MaskBlank((64, 64), 0.01, 1.52)
-    mask = contour_mask(0, blank, Path(5e-4, 5.0), feature=0.08, line_width=0.02)
+    mask = contour_mask(0, blank, LightPath(5e-4, 5.0), feature=0.08, line_width=0.02)
     ```
     """
     key = random_key(key)
@@ -186,7 +186,7 @@ class MaskSetting(eqx.Module):
         self.method = psf_method(flat, self.grid, "angular_spectrum", pixel_integration=True)
         for light in self.wavelengths:
             for away in self.object_distances:
-                path = Path(light, self.distance, away)
+                path = LightPath(light, self.distance, away)
                 require_phase_sampling(flat, self.grid, path, self.method)
 
     @property
@@ -206,7 +206,7 @@ class MaskSetting(eqx.Module):
             return angular_spectrum(
                 mask,
                 self.grid,
-                Path(light[0], self.distance, light[1]),
+                LightPath(light[0], self.distance, light[1]),
                 self.method,
                 padding=_PADDING,
             )
@@ -326,7 +326,7 @@ def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[A
     share = jnp.ones((), noise.dtype)
 
     def one(kernel):
-        camera = Channel(kernel[None], (1.0,), (share,), setting.distance, training)
+        camera = CaptureSum(kernel[None], (1.0,), (share,), setting.distance, training)
         return relative_error(restore_by((camera,), training), training)
 
     psfs = setting.psfs(mask).reshape(-1, *setting.grid.shape)

@@ -22,7 +22,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     propagate,
     spherical_wave,
 )
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 
 class Retrieval(Module):
@@ -38,7 +38,13 @@ class Retrieval(Module):
 
 @checked
 def retrieve_phase(
-    target: Float[Array, "y x"], grid: Grid, path: Path, *, shape: Shape, key: Key, steps: int = 100
+    target: Float[Array, "y x"],
+    grid: Grid,
+    path: LightPath,
+    *,
+    shape: Shape,
+    key: Key,
+    steps: int = 100,
 ) -> Retrieval:
     r"""The phase of a transparent mask whose PSF is near to a target (Gerchberg and Saxton 1972).
 
@@ -82,7 +88,7 @@ def match_error(psf: Float[Array, "y x"], target: Float[Array, "y x"]) -> Float[
 
 
 @functools.partial(jax.jit, static_argnames=("cells", "steps"))
-def _to_and_fro(target, grid: Grid, path: Path, cells: tuple[int, int], key, steps: int):
+def _to_and_fro(target, grid: Grid, path: LightPath, cells: tuple[int, int], key, steps: int):
     window = padded_shape(cells, grid.shape, 1.0)
     # One more where halves would not agree.
     window = tuple(w + (w - m) % 2 for w, m in zip(window, cells, strict=True))

@@ -165,7 +165,7 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     noise = noise_variance(viewing, light) * seen**2
     highest = 1 / (2 * viewing.cell)
     v, u = ((np.arange(n) + 0.5) / n for n in _FREQUENCIES)
-    grid = np.stack(np.meshgrid(u, 2 * v - 1), axis=-1).reshape(-1, 2) * highest
+    grid = np.stack(np.meshgrid(2 * v - 1, u, indexing="ij"), axis=-1).reshape(-1, 2) * highest
     frequencies = jnp.asarray(grid, dtype)
     prior = PowerLaw(2.5) if viewing.prior is None else viewing.prior
     density = prior(jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype))
@@ -194,7 +194,7 @@ def _rays(plate: Plate, viewing: Viewing):
     rows, columns = viewing.sensor.shape
     along = [(np.arange(n) + 0.5) / n for n in _FIELD]
     y, x = (2 * along[0] - 1) * rows / 2, along[1] * columns / 2
-    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    places = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
     pixels = jnp.asarray(places, plate.glass_thickness.dtype) * viewing.sensor.pitch
     rays = trace_band(camera, pixels, viewing.object_distance, 4, 6)
     guided = bragg_rays(camera, pixels).guided

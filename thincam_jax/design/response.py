@@ -33,7 +33,7 @@ from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies, Polar, Quadrant
 from thincam_jax.design.setup import Setup
 from thincam_jax.lensless.masks.base import ZoneOrders, pairs
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable_transfer import TransferFactors, overlaps_of
 
 
@@ -54,7 +54,7 @@ def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Respons
 
     def one(beta, phase, distance, wavelength, factors):
         mask = design.mask(beta, phase)
-        path = Path(wavelength, distance, setup.object_distance)
+        path = LightPath(wavelength, distance, setup.object_distance)
         if isinstance(frequencies, Quadrant):
             return _exact(mask.zone_orders(), path, setup, frequencies, factors)
         return _rings(mask.zone_orders(), path, setup, frequencies)
@@ -83,7 +83,7 @@ def _factors(
 
 def _exact(
     zones: ZoneOrders,
-    path: Path,
+    path: LightPath,
     setup: Setup,
     frequencies: Quadrant,
     factors: Complex[Array, "pair n"],
@@ -104,7 +104,7 @@ def _product(weights, factors: Complex[Array, "pair n"]) -> Float[Array, "n n"]:
     return TransferFactors(weights[:, None] * factors, factors).response()
 
 
-def _rings(zones: ZoneOrders, path: Path, setup: Setup, frequencies: Polar) -> Responses:
+def _rings(zones: ZoneOrders, path: LightPath, setup: Setup, frequencies: Polar) -> Responses:
     rho = frequencies.radius / path.distance
     along = [jnp.abs(f[:, None] * rho) for f in (frequencies.sine, frequencies.cosine)]
     first, second = np.triu_indices(len(zones.orders), 1)
@@ -131,7 +131,7 @@ def _rings(zones: ZoneOrders, path: Path, setup: Setup, frequencies: Polar) -> R
     return Responses(whole, seen)
 
 
-def _ring(zones: ZoneOrders, k, m, product, path: Path, rho) -> Float[Array, " n"]:
+def _ring(zones: ZoneOrders, k, m, product, path: LightPath, rho) -> Float[Array, " n"]:
     """The ring pattern of two orders without an edge, of the product of their coefficients."""
     curvature = (k - m) * zones.beta
     s = path.wavelength * path.distance
@@ -142,21 +142,21 @@ def _ring(zones: ZoneOrders, k, m, product, path: Path, rho) -> Float[Array, " n
     return -2 * jnp.pi * path.magnification**2 / curvature * jnp.imag(wave)
 
 
-def _place(zones: ZoneOrders, k, m, path: Path, u):
+def _place(zones: ZoneOrders, k, m, path: LightPath, u):
     """ζ(u): where on the mask, mm from its centre, the light of frequency u ≥ 0 comes from."""
     s = path.wavelength * path.distance * u
     tilt = (k + m) * zones.beta * s + 2 * jnp.pi * path.magnification * u
     return jnp.abs(tilt / (2 * (k - m) * zones.beta))
 
 
-def _open(zones: ZoneOrders, k, m, path: Path, u, place):
+def _open(zones: ZoneOrders, k, m, path: LightPath, u, place):
     """1 where that point lies in the aperture's overlap with itself, 0 beyond, over one zone."""
     half = (zones.width - path.wavelength * path.distance * u) / 2
     zone = jnp.sqrt(jnp.pi / (jnp.abs(k - m) * zones.beta)) / 4
     return jax.nn.sigmoid((half - place) / zone)
 
 
-def seen_part(place: Float[Array, "*place"], path: Path, setup: Setup):
+def seen_part(place: Float[Array, "*place"], path: LightPath, setup: Setup):
     """q: the part of the object's width from which that light falls on the sensor."""
     middle = path.magnification * place
     shadow = setup.field * path.distance

@@ -163,7 +163,7 @@ def relative_error(restored: Float[Array, "image v u"], training: Training) -> F
     return jnp.mean(error / jnp.var(training.images, axis=(-2, -1)))
 
 
-class Channel(eqx.Module):
+class CaptureSum(eqx.Module):
     """A sum of captures at one distance: A_c.
 
     - `kernels`: their PSFs, on `kernel_grid(training.sensor.grid, training.field_shape)`.
@@ -253,7 +253,7 @@ def check_captures(design: Design, training: Training) -> None:
             )
 
 
-def channels_of(design: Design, training: Training) -> tuple[Channel, ...]:
+def channels_of(design: Design, training: Training) -> tuple[CaptureSum, ...]:
     """The sums of captures that the training's synthesis asks for."""
     check_captures(design, training)
     kernels = _kernels(design, training)
@@ -261,7 +261,7 @@ def channels_of(design: Design, training: Training) -> tuple[Channel, ...]:
     def channel(row):
         used = np.flatnonzero(row)
         weights, exposure = tuple(row[k] for k in used), tuple(design.exposure[k] for k in used)
-        return Channel(kernels[used], weights, exposure, design.distance[used[0]], training)
+        return CaptureSum(kernels[used], weights, exposure, design.distance[used[0]], training)
 
     return tuple(channel(row) for row in training.synthesis)
 

@@ -39,7 +39,7 @@ from thincam_jax.design.cosine_transforms import (
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import PowerLaw
 from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
 from thincam_jax.reconstruction.synthesis import keep_bias
 from thincam_jax.reconstruction.wiener import crop_noise, inner_band, scene_power
@@ -124,7 +124,7 @@ def _channel(
     distance = design.distance[used[0]]
 
     def response(k):
-        path = Path(design.wavelength[k], distance, setup.object_distance)
+        path = LightPath(design.wavelength[k], distance, setup.object_distance)
         mask = design.mask(design.beta[k], design.phase[k])
         on_sensor = at / distance
         return transfer_factors(mask, path, on_sensor, on_sensor, pixel_pitch=pitch).response()

@@ -8,7 +8,7 @@ imports nothing of this; the libraries of the devices come with `thincam-jax[har
 from thincam_jax._core.names import modules_of
 from thincam_jax.hardware import plans as plans
 from thincam_jax.hardware.acquisition.acquire import acquire as acquire
-from thincam_jax.hardware.acquisition.read import read_acquisition as read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition as Acquisition
 from thincam_jax.hardware.acquisition.rig import open_rig as open_rig
 from thincam_jax.hardware.base import Camera as Camera
 from thincam_jax.hardware.base import CameraSettings as CameraSettings

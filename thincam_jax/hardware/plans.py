@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thincam_jax._core.arguments import checked
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step, picture_digest
+from thincam_jax.hardware.acquisition.plan import (
+    BLACK,
+    AcquisitionPlan,
+    AcquisitionStep,
+    Pattern,
+    picture_digest,
+)
 from thincam_jax.hardware.base import CameraSettings
 
 if TYPE_CHECKING:  # it brings JAX
@@ -33,7 +39,9 @@ def zone_plate(
 
 
 @checked
-def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_frames: int = 0) -> Plan:
+def fringe_scan(
+    mask: Pattern, settings: CameraSettings, *, dark_frames: int = 0
+) -> AcquisitionPlan:
     """Four captures of one zone plate with the phases 0, π/2, π and 3π/2.
 
     - `mask`: a `zone_plate`; its phase is replaced.
@@ -51,7 +59,7 @@ def method_a(
     *,
     stage_zero: float = 0.0,
     dark_frames: int = 0,
-) -> Plan:
+) -> AcquisitionPlan:
     """A fringe scan at each of several mask-sensor distances.
 
     - `distances`: mm; the stage moves to distance − `stage_zero`, the distance at its position 0.
@@ -67,7 +75,7 @@ def method_a(
 @checked
 def method_b(
     mask: Pattern, betas: Sequence[float], settings: CameraSettings, *, dark_frames: int = 0
-) -> Plan:
+) -> AcquisitionPlan:
     """Captures with the phases 0 and 3π/2 for each of several β, rad/mm²."""
     shots = [
         (_changed(mask, beta=beta, phase=phase), None) for beta in betas for phase in PHASE_PAIR
@@ -83,7 +91,7 @@ def psf_stack(
     *,
     stage_zero: float = 0.0,
     dark_frames: int = 0,
-) -> Plan:
+) -> AcquisitionPlan:
     """PSFs of one pattern for a point source on the stage, at several depths, mm.
 
     The stage moves to depth − `stage_zero`, the depth at its position 0.
@@ -93,8 +101,8 @@ def psf_stack(
 
 
 @checked
-def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
-    """The frames of a calibration by Hadamard patterns, which `open_captures` reads.
+def hadamard(series: "HadamardSeries", settings: CameraSettings) -> AcquisitionPlan:
+    """The frames of a calibration by Hadamard patterns, which `HadamardCaptures.load` reads.
 
     The dark frames of the series are spread evenly among the patterns, the first one first.
     """
@@ -110,7 +118,7 @@ def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
     plan = _plan("hadamard", shots, settings, series.dark_frames)
     # With few patterns and many dark frames the last ones come together.
     lacking = series.dark_frames - sum(step.dark for step in plan.steps)
-    black = Step(len(plan.patterns) - 1, dark=True)
+    black = AcquisitionStep(len(plan.patterns) - 1, dark=True)
     facts = {"series": {**described, "object_shape": [rows, columns]}}
     return dataclasses.replace(plan, steps=plan.steps + (black,) * lacking, facts=facts)
 
@@ -121,7 +129,7 @@ def pictures(
     *,
     frames: int = 1,
     dark_frames: int = 0,
-) -> Plan:
+) -> AcquisitionPlan:
     """Pictures on the cells of a monitor, `frames` captures of each.
 
     - `shown`: levels of the cells (row, column), uint8, by name. The plan has a digest of each: a
@@ -139,7 +147,7 @@ def levels_pattern(name: str, levels: np.ndarray, kind: str = "pixels") -> Patte
     return Pattern(kind, {"name": name, "digest": picture_digest(levels), **numbers})
 
 
-def grey_levels(settings: CameraSettings, *, frames: int = 1) -> Plan:
+def grey_levels(settings: CameraSettings, *, frames: int = 1) -> AcquisitionPlan:
     """Every fifteenth level of a display, the brightest first; `measured_levels` takes them."""
     levels = [Pattern("uniform", {"level": level}) for level in range(255, -1, -15)]
     return _plan("grey_levels", [(one, None) for one in levels for _ in range(frames)], settings, 0)
@@ -153,7 +161,7 @@ def alignment(
     *,
     frames: int = 1,
     dark_frames: int = 0,
-) -> Plan:
+) -> AcquisitionPlan:
     """Marks, one at a time, in rows and columns on a square of the side `spread`, mm.
 
     - `size`: diameter of a mark, mm. `frames`: number of frames of each.
@@ -171,7 +179,7 @@ def scene(
     exposures: Sequence[float] = (),
     frames: int = 1,
     dark_frames: int = 0,
-) -> Plan:
+) -> AcquisitionPlan:
     """Frames of what stands before the camera, which `Acquisition.merged` makes one image of.
 
     - `mask`: shown meanwhile, such as a `zone_plate`.
@@ -181,13 +189,13 @@ def scene(
     every = tuple(dataclasses.replace(settings, exposure=float(one)) for one in exposures)
     every = every or (settings,)
     steps = [
-        Step(int(dark), None, number, dark)
+        AcquisitionStep(int(dark), None, number, dark)
         for dark, count in ((False, frames), (True, dark_frames))
         for number in range(len(every))
         for _ in range(count)
     ]
     facts = {"bracket": len(every) > 1}
-    return Plan("scene", (mask, BLACK), every, tuple(steps), facts)
+    return AcquisitionPlan("scene", (mask, BLACK), every, tuple(steps), facts)
 
 
 def _changed(mask: Pattern, **numbers: float) -> Pattern:
@@ -203,7 +211,7 @@ def _plan(
     settings: CameraSettings,
     dark_frames: int,
     facts: Mapping[str, Any] | None = None,
-) -> Plan:
+) -> AcquisitionPlan:
     """Plan of (pattern, position) shots, with dark frames among them."""
     if dark_frames < 0:
         raise ValueError(f"dark_frames = {dark_frames}; give a whole number, 0 for no dark frames")
@@ -214,10 +222,12 @@ def _plan(
     for number, (pattern, position) in enumerate(shots):
         position = None if position is None else float(position)
         if every and number % every == 0:
-            steps.append(Step(len(patterns), position, dark=True))
-        steps.append(Step(index[_key(pattern)], position))
+            steps.append(AcquisitionStep(len(patterns), position, dark=True))
+        steps.append(AcquisitionStep(index[_key(pattern)], position))
     black = (BLACK,) if every else ()
-    return Plan(name, (*patterns.values(), *black), (settings,), tuple(steps), facts or {})
+    return AcquisitionPlan(
+        name, (*patterns.values(), *black), (settings,), tuple(steps), facts or {}
+    )
 
 
 def _key(pattern: Pattern) -> tuple[object, ...]:

@@ -16,7 +16,7 @@ import tifffile
 
 from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.files import write_whole
-from thincam_jax.hardware.acquisition.plan import Plan, Step
+from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
 from thincam_jax.hardware.base import CameraSettings, Frame
@@ -108,7 +108,7 @@ class Preview:
     def __init__(
         self,
         rig: Rig,
-        plan: Plan,
+        plan: AcquisitionPlan,
         procedure: Procedure | None = None,
         *,
         image: Callable[[np.ndarray], np.ndarray] | None = None,
@@ -195,7 +195,7 @@ class Preview:
         asked = dataclasses.replace(self.plan.settings[0], **turned_to)
         if asked != self._asked:
             self.settings, self._asked = self.taker.set_near(asked), asked
-        step = Step(self._pattern, self._position)
+        step = AcquisitionStep(self._pattern, self._position)
         return self.taker.take(step, self.settings, probe=True)[0]
 
     def _keep(self, frame: Frame) -> Path:

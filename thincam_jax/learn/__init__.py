@@ -1,10 +1,8 @@
-"""Learned parts: a denoiser, unrolled solvers, refocusing networks, suggestions of designs."""
+"""Learned parts: a denoiser, unrolled solvers, refocusing networks."""
 
 from thincam_jax._core.names import modules_of
 from thincam_jax.learn.denoiser.network import Denoiser as Denoiser
 from thincam_jax.learn.refocusing.store import load as load
-from thincam_jax.learn.suggestions import Suggester as Suggester
-from thincam_jax.learn.suggestions import suggest as suggest
 from thincam_jax.learn.tau import learn_tau as learn_tau
 from thincam_jax.learn.unrolled import UnrolledAdmm as UnrolledAdmm
 

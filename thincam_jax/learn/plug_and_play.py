@@ -41,7 +41,7 @@ from thincam_jax.reconstruction.normal_equations import (
     normal_equations,
     padded_field,
 )
-from thincam_jax.reconstruction.outside_light import pinned
+from thincam_jax.reconstruction.outside_light import beyond_field, covering, pinned
 from thincam_jax.reconstruction.parallel import independent_parts
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
@@ -55,6 +55,7 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.result import saying
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
@@ -161,7 +162,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         callback: Callback | None = None,
     ):
         """Reconstruct; with a start image that is not dark s begins lower."""
-        began = time.perf_counter()
+        began, recording = time.perf_counter(), covering(recording, start)
         apart = TotalVariation(coupling="none")  # colours
         # Data steps are linear, and so without a constraint.
         problem = recording.problem(regulariser=apart, nonnegative=False, synthesis=self.synthesis)
@@ -213,7 +214,12 @@ class PlugAndPlay(AbstractIterativeSolver):
         done, seconds = max(len(history) - 1, 0), time.perf_counter() - began
         whole_image = jnp.stack(images).reshape(problem.image_shape)
         outcome = Outcome(whole_image, status, tuple(history), done, seconds)
-        return recording.reconstruction(outcome, self.name)
+        result, wide, beyond = recording.reconstruction(outcome, self.name), None, ""
+        if status in ("converged", "iterations_exhausted"):
+            wide, beyond = beyond_field(recording, problem, whole_image, self.synthesis)
+        if wide is not None:
+            result = self.solve(wide, start=start, callback=callback)
+        return saying(result, beyond, result.reason)
 
     def _begin_smooth(self, recording: Recording, problem: InverseProblem, runs: list["_Run"]):
         """Begin the runs with images by total variation of the noise that was found."""

@@ -108,7 +108,7 @@ def _elements(problem: InverseProblem):
     return captures, weights
 
 
-class Training(eqx.Module):
+class UnrolledTraining(eqx.Module):
     """The best model by its loss, and the loss before each step.
 
     - `status`: "converged" never: "iterations_exhausted", or "non_finite" if a loss was NaN,
@@ -140,7 +140,7 @@ def train(
     *,
     key: PRNGKeyArray,
     descent: Adam = Adam(),
-) -> Training:
+) -> UnrolledTraining:
     """Fit a model to pairs of captures and images, by the mean squared error.
 
     `problem`: its captures (pair, channel, y, x) belong to `images`.
@@ -159,12 +159,12 @@ def train(
         model, state, loss = _descend(model, state, rate, problem, images, chosen)
         losses.append(float(loss))
         if not math.isfinite(losses[-1]):
-            return Training(best, tuple(losses), "non_finite")
+            return UnrolledTraining(best, tuple(losses), "non_finite")
         if n % 10 == 9 or n == steps - 1:
             whole = float(training_loss(model, problem, images))
             if whole < lowest:
                 best, lowest = model, whole
-    return Training(best, tuple(losses), "iterations_exhausted")
+    return UnrolledTraining(best, tuple(losses), "iterations_exhausted")
 
 
 def solve_unrolled(problem: InverseProblem, model: UnrolledAdmm) -> Outcome:

@@ -16,7 +16,7 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 
 def _mask(given: Any) -> AbstractMask:
@@ -55,7 +55,9 @@ class LenslessCamera(Module):
         """The camera with the pixels of a grid in place of the sensor's."""
         return replace(self, sensor=Sensor(grid.shape, grid.pitch))
 
-    def path(self, wavelength: Number, object_distance: Number, at: Position | None = None) -> Path:
+    def path(
+        self, wavelength: Number, object_distance: Number, at: Position | None = None
+    ) -> LightPath:
         """The light's path from a point `object_distance` (mm) before the mask, as `psf` has it."""
         # Plain numbers take the camera's precision, so that float32 cameras stay float32. In NumPy,
         # they stay known inside jit.
@@ -64,14 +66,14 @@ class LenslessCamera(Module):
         if isinstance(object_distance, int | float):
             object_distance = like(object_distance)
         if at is None:
-            return Path(wavelength, self.distance, object_distance)
+            return LightPath(wavelength, self.distance, object_distance)
         on_an_axis = self._knows_axis(at)
         if isinstance(at, tuple | list):
             if all(isinstance(n, int | float) for n in at):
                 at = like(at)
             elif any(map(checks.is_traced, at)):
                 at = jnp.stack([jnp.asarray(n, self.distance.dtype) for n in at])
-        path = Path(wavelength, self.distance, object_distance, at)
+        path = LightPath(wavelength, self.distance, object_distance, at)
         convert = jnp.asarray if checks.is_traced(path.at) else np.asarray
         path = replace(path, at=convert(path.at, dtype=self.distance.dtype))
         return replace(path, skew=not on_an_axis and path.is_skew(self.mask.centre))

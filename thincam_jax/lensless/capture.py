@@ -13,7 +13,7 @@ from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
-from thincam_jax.lensless.plan.run import Plan, run_plan
+from thincam_jax.lensless.plan.run import CapturePlan, run_plan
 from thincam_jax.lensless.sampling import warn_if_unresolved
 
 _ON_AXIS = (
@@ -29,7 +29,7 @@ def capture(
     *,
     key: Any = None,
     noise: AbstractNoise | None = None,
-    model: Model | PsfMethod | Plan = "separable",
+    model: Model | PsfMethod | CapturePlan = "separable",
     pixel_integration: bool | None = None,
 ) -> Float[Array, "*batch y x"]:
     r"""The captured image of a scene (thesis Eq 3.8): Σ over planes and wavelengths of h ∗ f_d.
@@ -45,7 +45,7 @@ def capture(
 
     - `scene`: planes with a common batch shape; the batch is captured image by image.
     - `noise`, `key`: see `thincam_jax.imaging.sensor`; without noise the result is deterministic.
-    - `model`: PSF model or `PsfMethod`, see `psf`; or what `thincam_jax.plan` returns.
+    - `model`: PSF model or `PsfMethod`, see `psf`; or what `plan_capture` returns.
     - `pixel_integration`: average the PSF over the pixels, as a real sensor does; by default yes,
       or as planned.
 
@@ -66,7 +66,7 @@ def capture(
     **See also**: `Scene`, `plan_capture`, `reconstruct`.
     """
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
-    if isinstance(model, Plan):
+    if isinstance(model, CapturePlan):
         if pixel_integration is not None:
             raise ValueError("a plan chooses pixel_integration: leave it out")
         image = run_plan(model, camera, scene)

@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 # Fringes whose phase is known to a twentieth of a radian are wrong by some per cent.
 _LARGEST = 0.05 * 2.0**24
 
 
-def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> None:
+def require_digits(mask: AbstractMask, grid: Grid, path: LightPath, model: str) -> None:
     r"""ValueError where float32 cannot represent the phase of the zones on the sensor.
 
     The fringes of the order k have the phase :math:`k\beta r^2/(M^2(1+k\epsilon))` at r on the
@@ -32,7 +32,7 @@ def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> No
         )
 
 
-def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bool:
+def held_in_single(mask: AbstractMask, grid: Grid, path: LightPath, model: str) -> bool:
     """Whether float32 can represent the zones' phases; True for traced numbers."""
     numbers = jax.tree.leaves((mask, grid, path))
     if not hasattr(mask, "zone_orders") or any(checks.is_traced(n) for n in numbers):
@@ -40,7 +40,7 @@ def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bo
     return largest_phase(mask, grid, path, model) <= _LARGEST
 
 
-def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
+def largest_phase(mask: Any, grid: Grid, path: LightPath, model: str) -> float:
     """Largest phase, rad, of the orders' fringes where they are strong and light falls."""
     with jax.ensure_compile_time_eval():  # inside jit, sums of known numbers are traced as well
         scale, epsilon = map(float, _scale_and_epsilon(path, mask.beta))
@@ -65,5 +65,5 @@ def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
 
 
 @jax.jit
-def _scale_and_epsilon(path: Path, beta: Float[Array, ""]):
+def _scale_and_epsilon(path: LightPath, beta: Float[Array, ""]):
     return path.magnification, path.epsilon(beta)

@@ -54,7 +54,7 @@ from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
 from thincam_jax.lensless.propagation.obliquity import require_off_axis
 from thincam_jax.lensless.propagation.paraxial import paraxial
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import profile_samples, radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
@@ -81,7 +81,7 @@ def psf(
     object_distance: Number = math.inf,
     at: Position | None = None,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Float[Array, "y x"]:
     """Point spread function on the sensor: irradiance relative to the open aperture.
 
@@ -91,7 +91,7 @@ def psf(
     - `object_distance`: t, mm; infinity is a plane wave.
     - `at`: (y, x) of the point, mm, by default on the axis; of a plane wave the tangents of its
       angles. The shadow then moves by −d/t of it, and the waves are those about the ray through the
-      mask's middle (`thincam_jax.lensless.Path`). Of cells off both axes, and of rings,
+      mask's middle (`thincam_jax.lensless.LightPath`). Of cells off both axes, and of rings,
       "separable" then samples: for a MURA of 23 × 23 cells of 62 µm (d = 6.5 mm, averages over
       pixels of 22 µm) 0.8 % off at 20° and 30°, at azimuths of 30° and 45°; 6 % at the centres of
       pixels. A traced point counts as off both axes, unless one coordinate is a plain 0.
@@ -99,8 +99,8 @@ def psf(
       "angular_spectrum" or "rayleigh_sommerfeld"; each is documented in
       `thincam_jax.lensless.propagation`. A `PsfMethod` sets the precision and the samples of a
       model, too.
-    - `pixel_integration`: average over each pixel in place of the value at its centre; of
-      "separable" by as many nodes as its fringes need, at most 320, which leave up to 0.2 % where a
+    - `pixel_integration`: average over each pixel; False is the value at its centre. "separable"
+      averages by as many nodes as its fringes need, at most 320, which leave up to 0.2 % where a
       pixel holds more than 197, pitch·width/(λd). Where these are traced there are 24 nodes, for
       9.5 fringes; `PsfMethod(nodes=)` sets others, `predict_error` tells what they leave.
 
@@ -132,11 +132,11 @@ def psf_about_ray(
     camera: LenslessCamera,
     wavelength: Number,
     object_distance: Number,
-    at: Position,
+    at: Position | None,
     method: PsfMethod,
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
-    path = replace(camera.path(wavelength, object_distance, at), follows=True)
+    path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
     return _evaluate(_psf, camera, path, method)
 
 
@@ -149,14 +149,9 @@ def spectral_psf(
     at: Position | None = None,
 ) -> Float[Array, "y x"]:
     """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
-    camera = camera.on_grid(grid)
-
-    def alone(wavelength: Number) -> Float[Array, "y x"]:
-        if at is not None:
-            return psf_about_ray(camera, wavelength, object_distance, at, method)
-        return psf(camera, wavelength=wavelength, object_distance=object_distance, model=method)
-
-    return functools.reduce(operator.add, (weight * alone(w) for w, weight in light))
+    own = camera.on_grid(grid)
+    parts = (weight * psf_about_ray(own, w, object_distance, at, method) for w, weight in light)
+    return functools.reduce(operator.add, parts)
 
 
 @checked
@@ -167,7 +162,7 @@ def otf(
     object_distance: Number = math.inf,
     at: Position | None = None,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Complex[Array, "v u"]:
     """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
 
@@ -234,13 +229,8 @@ def mtf(
     if not checks.holds_traced(rho, grid.pitch):
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
-    h = psf(
-        camera,
-        wavelength=wavelength,
-        object_distance=object_distance,
-        model=model,
-        pixel_integration=pixel_integration,
-    )
+    path = camera.path(wavelength, object_distance)
+    h = _evaluate(_psf, camera, path, as_method(model, pixel_integration))
     return _contrast(h, grid, rho)
 
 
@@ -257,7 +247,7 @@ def _contrast(h: Float[Array, "y x"], grid: Grid, rho: Float[Array, " n"]) -> Fl
 
 
 def _irradiance(
-    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
@@ -275,7 +265,7 @@ def _irradiance(
 
 
 def _closed(
-    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     model, average = method.model, method.pixel_integration
     if model == "geometric":
@@ -287,7 +277,9 @@ def _closed(
 
 
 @jax.jit(static_argnames="method")
-def closed_terms(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> SeparableSum:
+def closed_terms(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> SeparableSum:
     """The PSF of a mask of separable terms by one of the closed forms, as separable terms."""
     h = _closed(mask, grid, path, method)
     if isinstance(h, ChirpSum):
@@ -297,7 +289,7 @@ def closed_terms(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) 
 
 
 @jax.jit(static_argnames="method")
-def _psf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _psf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         h = h.sample(grid, pixel_integration=method.pixel_integration)
@@ -305,7 +297,7 @@ def _psf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
 
 
 @jax.jit(static_argnames="method")
-def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _otf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         return h.transform(grid)
@@ -316,7 +308,9 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> PsfMethod:
+def sampled_off_axis(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> PsfMethod:
     """The method; in place of "separable" samples where a mask of edges has no closed form.
 
     That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
@@ -339,7 +333,7 @@ def sampled_off_axis(mask: AbstractMask, grid: Grid, path: Path, method: PsfMeth
     return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
 
 
-def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
+def _evaluate(function, camera: LenslessCamera, path: LightPath, method: PsfMethod):
     """Value of a function in the method's precision, returned in the camera's."""
     mask, grid = camera.mask, camera.sensor.grid
     tolerance = AVERAGES * (method.field_tolerance or 0.0)
@@ -379,7 +373,7 @@ def _evaluate(function, camera: LenslessCamera, path: Path, method: PsfMethod):
     return result if method.precision == own else cast(result, own)
 
 
-def _unfocused(mask: AbstractMask, path: Path) -> AbstractMask:
+def _unfocused(mask: AbstractMask, path: LightPath) -> AbstractMask:
     return eqx.error_if(
         mask,
         in_focus(mask, path),

@@ -14,7 +14,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.phase import PhaseMask
 from thincam_jax.lensless.method import Model, PsfMethod, odd_from
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 
 class SamplingWarning(UserWarning):
@@ -68,7 +68,9 @@ def warn_if_unresolved(camera: LenslessCamera, distances: Iterable[Any]) -> None
             warnings.warn(fault, SamplingWarning, stacklevel=3)
 
 
-def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> None:
+def require_phase_sampling(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> None:
     r"""ValueError where samples do not hold the phases of a `PhaseMask`, with what does.
 
     The light just behind the mask has the local frequency ν = |∂φ/∂x|/2π + ν_lit along an axis;
@@ -111,14 +113,14 @@ def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: P
     )
 
 
-def samples_needed(mask: AbstractMask, grid: Grid, path: Path, model: Model) -> int:
+def samples_needed(mask: AbstractMask, grid: Grid, path: LightPath, model: Model) -> int:
     """Samples a pixel, odd, that hold the phases of a `PhaseMask`; 1 of other masks."""
     if not isinstance(mask, PhaseMask):
         return 1
     return odd_from(2 * float(grid.pitch) * _frequencies(mask, grid, path, model)[1])
 
 
-def _frequencies(mask: PhaseMask, grid: Grid, path: Path, model: Model) -> tuple[float, float]:
+def _frequencies(mask: PhaseMask, grid: Grid, path: LightPath, model: Model) -> tuple[float, float]:
     """The highest local frequency that the relief makes, and that of the light, cycles/mm."""
     wavelength, distance, away = (
         float(n) for n in (path.wavelength, path.distance, path.object_distance)

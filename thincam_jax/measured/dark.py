@@ -17,7 +17,7 @@ _NEAR = np.add.outer(np.arange(5) % 2, np.arange(5) % 2) == 0  # one colour, als
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundLevels:
     """Levels (channel, 1, 1) of "psf" and "capture", how they were found, and the PSF's corner."""
 
     levels: dict[str, np.ndarray]
@@ -25,7 +25,7 @@ class Found:
     square: tuple[Any, ...]
 
 
-def corner_levels(planes: Mapping[str, np.ndarray], square: tuple[Any, ...]) -> Found:
+def corner_levels(planes: Mapping[str, np.ndarray], square: tuple[Any, ...]) -> FoundLevels:
     """Means of a square of the PSF, for both images."""
     level = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     level = level.astype(np.float32)
@@ -34,12 +34,12 @@ def corner_levels(planes: Mapping[str, np.ndarray], square: tuple[Any, ...]) -> 
         "psf": level,
         "capture": level if len(level) == len(planes.get("capture", ())) else mean,
     }
-    return Found(levels, dict.fromkeys(levels, "corner"), square)
+    return FoundLevels(levels, dict.fromkeys(levels, "corner"), square)
 
 
 def find_levels(
     planes: Mapping[str, np.ndarray], corner: tuple[int, int], bayer: Pattern | None
-) -> Found:
+) -> FoundLevels:
     """Find black levels of a PSF and a capture (channel, y, x), both in parts of one full scale.
 
     The mean of the PSF's first corner that `is_dark`, beginning with the upper left. A capture that
@@ -62,7 +62,7 @@ def find_levels(
     lowest = np.float32(min(_lowest(one, bayer) for one in planes.values())).reshape(1, 1, 1)
     levels = {"psf": lowest, "capture": np.zeros_like(lowest)}
     sources = {"psf": "lowest value", "capture": "found with the image"}
-    return Found(levels, sources, squares[0])
+    return FoundLevels(levels, sources, squares[0])
 
 
 def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaiced
-from thincam_jax.measured.dark import Found, corner_levels, find_levels
+from thincam_jax.measured.dark import FoundLevels, corner_levels, find_levels
 from thincam_jax.measured.options import Centre, Preparation, by_files, check_match
 from thincam_jax.measured.preparation_log import Centring, CleanUp, ImageLog, PreparationLog
 from thincam_jax.measured.raw import MeasurementError, Raw
@@ -60,9 +60,9 @@ class _Frame:
 def prepare(
     psf: Raw,
     capture: Raw,
+    *,
     background: Background | None = None,
     options: Preparation | None = None,
-    *,
     psf_background: Background | None = None,
     dead: Bool[np.ndarray, "y x"] | None = None,
 ) -> Prepared:
@@ -156,7 +156,7 @@ def prepare(
     return Prepared(light, image, valid, log, variance)
 
 
-def _found(planes, backgrounds: dict[str, Background], raws, options: Preparation) -> Found:
+def _found(planes, backgrounds: dict[str, Background], raws, options: Preparation) -> FoundLevels:
     """Background levels of the images that come without one; warns where no corner is dark."""
     sought = [name for name, one in backgrounds.items() if isinstance(one, str) and one == "found"]
     if not sought:

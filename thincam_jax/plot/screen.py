@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
-from thincam_jax import waveguide as wg
 from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.pictures import Reconstructed
@@ -104,11 +103,11 @@ def draw_rays(study: ScreenStudy) -> Figure:
     """Side view: rays of three pixels from the sensor through the plate to its front."""
     camera, screen = study.camera, study.camera.screen
     half = 0.43 * camera.sensor.shape[0] * float(camera.sensor.pitch)
-    pixels = np.array([[0.0, -half], [0.0, 0.0], [0.0, half]])
-    rays = wg.trace(camera, jnp.asarray(pixels), study.plane.distance, study.orders)
+    pixels = np.array([[-half, 0.0], [0.0, 0.0], [half, 0.0]])
+    rays = study.rays(camera, jnp.asarray(pixels))
     d0, d1 = float(camera.focal_distance), float(camera.lens_distance)
     width, start = float(screen.glass_thickness), d0 + d1
-    slopes = -pixels[:, 1] / d0
+    slopes = -pixels[:, 0] / d0
     sines = slopes / np.hypot(1, slopes)
     index = np.asarray(screen.glass_index(rays.wavelength))
     crossing = width * sines / np.sqrt(index**2 - sines**2)
@@ -116,7 +115,7 @@ def draw_rays(study: ScreenStudy) -> Figure:
     bounce = width * along[:, 1] / np.sqrt(index**2 - np.sum(along**2, axis=-1))
     figure, ax = drawing((9.5, 4.6))
     ahead = 5 * width
-    for n, (pixel, light) in enumerate(zip(pixels[:, 1], rays.wavelength, strict=True)):
+    for n, (pixel, light) in enumerate(zip(pixels[:, 0], rays.wavelength, strict=True)):
         style = line_style(n + 1)
         del style["marker"]
         top = d1 * slopes[n] + crossing[n]

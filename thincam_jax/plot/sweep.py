@@ -11,13 +11,13 @@ from thincam_jax._core.quantity import quantities
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.plot.frame import drawing, line_style
 
 _MAPS = 4  # of methods, at most
 # Of the swept values that are numbers, by the last key of their path.
 _QUANTITIES = quantities(
-    *(FresnelZoneAperture, Path, Sensor, GaussianNoise, PoissonGaussianNoise, ImagePlane)
+    *(FresnelZoneAperture, LightPath, Sensor, GaussianNoise, PoissonGaussianNoise, ImagePlane)
 )
 _QUANTITIES["phases"] = _QUANTITIES["phase"]
 

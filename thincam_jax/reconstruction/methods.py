@@ -22,7 +22,7 @@ from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
 from thincam_jax.reconstruction.other_psf import RESIZE, better_psf
-from thincam_jax.reconstruction.outside_light import covering, outside_light, with_field
+from thincam_jax.reconstruction.outside_light import beyond_field, covering
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -30,7 +30,7 @@ from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
-from thincam_jax.reconstruction.result import Reconstruction
+from thincam_jax.reconstruction.result import Reconstruction, saying
 from thincam_jax.reconstruction.ridge import Ridge
 from thincam_jax.reconstruction.smooth_misfit import misfit_of
 from thincam_jax.reconstruction.solver import (
@@ -127,17 +127,12 @@ def reconstruct(
         raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:
         result = solver.solve(recording)
-    return _saying(result, reason, result.reason)
-
-
-def _saying(result: Reconstruction, *reasons: str) -> Reconstruction:
-    said = "; ".join(filter(None, reasons))
-    return dataclasses.replace(result, reason=said) if said else result
+    return saying(result, reason, result.reason)
 
 
 @checked
 def choose_solver(
-    recording: Recording, synthesis: Synthesis | None = None
+    recording: Recording, *, synthesis: Synthesis | None = None
 ) -> tuple[AbstractSolver, str]:
     """Choose `Wiener`, `AdmmTV` or `Fista`, and give the reason in a sentence.
 
@@ -238,21 +233,20 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
-        outside, ended = None, outcome.status
+        wide, beyond, ended = None, "", outcome.status
         settled = ended == "iterations_exhausted" and outcome.iterations >= _SETTLED
         if ended == "converged" or settled:
-            outside = outside_light(recording, problem, outcome.image, self.synthesis)
-        if outside is not None and recording.imaging_model.pixels is None:  # type: ignore
-            wide = with_field(recording, outside.field_shape)
+            wide, beyond = beyond_field(recording, problem, outcome.image, self.synthesis)
+        if wide is not None:
             again = self.solve(wide, start=start, callback=callback)
-            return _saying(again, outside.taken, again.reason)
+            return saying(again, beyond, again.reason)
         if unit is not None:
             outcome = dataclasses.replace(outcome, image=outcome.image / unit)
         if rule:
             outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
         result = recording.reconstruction(outcome, self.name, float(problem.tau))
-        said = "" if outside and outcome.reason.endswith(RESIZE) else outcome.reason
-        return _saying(result, reason, said, str(outside or ""))
+        said = "" if beyond and outcome.reason.endswith(RESIZE) else outcome.reason
+        return saying(result, reason, said, beyond)
 
 
 class AdmmTV(AbstractRegularised):

@@ -66,7 +66,7 @@ def outside_light(
     whole = max(model.seen_field[0], field[0]), max(model.seen_field[1], field[1])
     try:
         wide = with_field(recording, whole).problem(
-            tau=problem.tau, nonnegative=problem.nonnegative, synthesis=synthesis
+            tau=problem.tau, nonnegative=bool(image.min() >= 0), synthesis=synthesis
         )
     except MemoryError:
         return None
@@ -93,6 +93,21 @@ def outside_light(
         _held(light.sum(axis=1 - axis), size, field[axis], whole[axis]) for axis in (0, 1)
     )
     return OutsideLight(share, same_parity((height, width), model.cameras[0].sensor.shape))
+
+
+def beyond_field(
+    recording: Recording, problem: InverseProblem, image: Image, synthesis: np.ndarray | None
+) -> tuple[Recording | None, str]:
+    """The recording to solve once more, with the field that holds the light, and the sentence.
+
+    None where the field is given, which stays, and where no light comes from outside.
+    """
+    outside = outside_light(recording, problem, image, synthesis)
+    if outside is None:
+        return None, ""
+    if recording.imaging_model.pixels is not None:  # type: ignore[union-attr]
+        return None, str(outside)
+    return with_field(recording, outside.field_shape), outside.taken
 
 
 def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recording:

@@ -32,6 +32,7 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.quantity import whole
 from thincam_jax.reconstruction.imaging_model import Cameras, distance_ratios
 from thincam_jax.reconstruction.iterate import Callback, Outcome, outcome_of_run
+from thincam_jax.reconstruction.outside_light import beyond_field, covering
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     backprojected_noise,
@@ -42,6 +43,7 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.result import saying
 from thincam_jax.reconstruction.solver import (
     DEFAULT_TAU,
     AbstractIterativeSolver,
@@ -180,6 +182,7 @@ class PoissonTV(AbstractIterativeSolver):
         counted = recording.with_noise(1.0)
         if recording.background is None:  # the solver's own is known
             counted = dataclasses.replace(counted, background=0.0)
+        counted = covering(counted, start)
         problem = counted.problem(tau=self.tau, regulariser=self.variation)
         image = None
         if start is not None:
@@ -191,7 +194,11 @@ class PoissonTV(AbstractIterativeSolver):
             iterations=self.iterations,
             tolerance=self.tolerance,
         )
-        return recording.reconstruction(outcome, self.name, float(self.tau))
+        result = recording.reconstruction(outcome, self.name, float(self.tau))
+        wide, beyond = beyond_field(recording, recording.problem(), outcome.image, None)
+        if wide is not None:
+            result = self.solve(wide, start=start)
+        return saying(result, beyond, result.reason)
 
 
 def solve_poisson(

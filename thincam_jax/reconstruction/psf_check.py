@@ -61,20 +61,6 @@ class PsfCheck:
       objective at each, relative to the lowest of all.
     - `noise_ratio`: rms of the residual of the best PSF over the noise; near 1 it explains all.
     - `reasons`: one line for each fault; empty if the PSF fits as given.
-
-    ```python
-    import jax.numpy as jnp
-    import numpy as np
-    import thincam_jax as tc
-
-    psfs = tc.Psfs(np.random.default_rng(0).random((1, 13, 13)) ** 6)
-    camera = tc.Recording(np.ones((1, 32, 40)), psfs).problem().operators[0]
-    chart = jnp.zeros(camera.in_shape).at[..., 12:20, 16:26].set(1.0)
-    check = tc.check_psf(tc.Recording(np.asarray(camera(chart))[None], psfs), search=0.02)
-    print(round(check.scale, 2))  # 1.0
-    ```
-
-    **See also**: `check_psf`.
     """
 
     orientation: Orientation

@@ -34,7 +34,7 @@ from thincam_jax.reconstruction.problem import Background, InverseProblem, as_re
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.synthesis import (
-    Channel,
+    SynthesisRow,
     channel_capture,
     separate,
     synthesis_matrix,
@@ -380,14 +380,14 @@ class Recording(Module):
         whole = tuple(s + k - 1 for s, k in zip(sensor, kernel, strict=True))
         return _fitting_field(model.field_shape or whole, sensor, kernel)  # type: ignore
 
-    def _channels(self, synthesis, captures, valid) -> tuple[np.ndarray, list[Channel]]:
+    def _channels(self, synthesis, captures, valid) -> tuple[np.ndarray, list[SynthesisRow]]:
         """The channels of a synthesis."""
         model, (matrix, ratios) = self.imaging_model, self.synthesis_rows(synthesis)
         if isinstance(model, Cameras):
             kernels = model.kernels(self._field(), ratios)
         else:
             kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
-        return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
+        return matrix, [SynthesisRow(row, kernels, captures, valid, ratios) for row in matrix]
 
     def synthesis_rows(self, synthesis: Any) -> tuple[np.ndarray, list[float]]:
         """The matrix (channel × capture) of a synthesis, and the enlargement of each capture."""

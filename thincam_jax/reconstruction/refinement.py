@@ -54,17 +54,6 @@ class Refinement:
       are in mm; `distance` is that of the furthest camera, the others change in proportion.
     - `undetermined`: numbers that the captures do not determine, left as given, with the reason.
     - `noise_ratio_before`, `noise_ratio`: rms of the residual of hidden pixels over the noise.
-
-    ```python
-    import numpy as np
-    import thincam_jax as tc
-
-    psf, seen = np.random.default_rng(0).random((2, 1, 32, 40))
-    recording = tc.Recording(seen, tc.Psfs(psf[..., :13, :13]), noise_variance=1e-4)
-    print(tc.refine(recording, parameters=["shift"]).is_changed)  # False
-    ```
-
-    **See also**: `refine`.
     """
 
     recording: Recording

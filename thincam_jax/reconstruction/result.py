@@ -1,5 +1,7 @@
 """Reconstructed images."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -56,3 +58,9 @@ class Reconstruction(Module):
         from thincam_jax.plot.images import draw_result
 
         return as_png(draw_result(self))
+
+
+def saying(result: Reconstruction, *reasons: str) -> Reconstruction:
+    """A result whose reason is these, those that are not empty."""
+    said = "; ".join(filter(None, reasons))
+    return dataclasses.replace(result, reason=said) if said else result

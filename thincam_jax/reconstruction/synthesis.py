@@ -135,7 +135,7 @@ def synthesis_matrix(
     return synthesis
 
 
-class Channel:
+class SynthesisRow:
     """A row of a synthesis: its kernel, its capture and the mask of its valid pixels."""
 
     def __init__(

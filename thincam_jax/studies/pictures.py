@@ -50,7 +50,7 @@ class TargetScores:
 
 
 @dataclass(frozen=True)
-class MethodScores:
+class SolverScores:
     """Figures of merit of a solver with a model; `targets` by name. The time has compilation."""
 
     mean_psnr_db: float | None
@@ -65,7 +65,7 @@ class Reconstructed:
     """The targets as a solver reconstructs them with a model, and their scores."""
 
     images: Float[np.ndarray, "target y x *channel"]
-    scores: MethodScores
+    scores: SolverScores
 
 
 def reconstructed(
@@ -93,7 +93,7 @@ def reconstructed(
     }
     mean = rounded(float(np.mean(scores))) if scores else None
     means = mean, round(seconds / len(images), 3)
-    return Reconstructed(images, MethodScores(*means, found.status, found.iterations, of_targets))
+    return Reconstructed(images, SolverScores(*means, found.status, found.iterations, of_targets))
 
 
 def finding(methods: Mapping[str, Reconstructed]) -> str:

@@ -13,7 +13,7 @@ from thincam_jax.studies.study import Method, Study
 
 
 @dataclass(frozen=True)
-class Limits:
+class ResponseLimits:
     """Where a response has its first zero crossing (None: it has none) and where it ends."""
 
     first_zero_cycles_per_mm: float | None
@@ -33,7 +33,7 @@ class Response:
 
     frequency: np.ndarray
     magnitude: np.ndarray
-    limits: Limits
+    limits: ResponseLimits
 
 
 @checked
@@ -69,7 +69,7 @@ def method_response(study: Study, method: Method) -> Response:
     return Response(
         frequency,
         magnitude,
-        Limits(
+        ResponseLimits(
             None if zero is None else round(zero, 3),
             None if zero is None else round(magnification / zero, 3),
             round(limit, 3),
@@ -90,12 +90,8 @@ def _groups(study: Study, method: Method) -> list[tuple[Exposure, np.ndarray]]:
 
 def _profile(study: Study, exposure: Exposure) -> np.ndarray:
     """The OTF of one exposure along u ≥ 0, v = 0."""
-    response = otf(
-        study.camera(exposure),
-        wavelength=exposure.wavelength,
-        object_distance=study.object_distance,
-        model=study.model,
-        pixel_integration=study.pixel_integration,
-    )
+    light = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
+    how = {"model": study.model, "pixel_integration": study.pixel_integration}
+    response = otf(study.camera(exposure), **light, **how)
     rows, columns = study.sensor.shape
     return np.asarray(response[rows // 2, columns // 2 :])

@@ -12,7 +12,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.table import Table, number
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.studies.evaluate import Evaluation, Resolved, Scores, evaluate_method
-from thincam_jax.studies.response import Limits, Response, method_response
+from thincam_jax.studies.response import Response, ResponseLimits, method_response
 from thincam_jax.studies.simulate import take
 from thincam_jax.studies.study import Method, Published, Study, Target
 
@@ -26,7 +26,7 @@ class MethodScores:
 
     captures: int
     mean_psnr_of_pictures_db: float | None
-    limits: Limits
+    limits: ResponseLimits
     targets: dict[str, Scores]
     published: Published
 

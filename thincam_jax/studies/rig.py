@@ -189,7 +189,7 @@ def monitor_system(
     **Errors**: ValueError for a screen that guides no light, or none of the monitor's.
     """
     wg.check_screen(camera)
-    system = wg.system_operator(camera, plane, orders, band_samples)
+    system = wg.system_operator(camera, plane, orders=orders, samples=band_samples)
     assert isinstance(system, Sparse)
     brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
     if not brightest > 0:
@@ -280,7 +280,7 @@ def calibrated(path: Path, folder: Path) -> tuple[Any, ReducedMatrix]:
     **Errors**: CaptureStoreError, ValueError or OSError, one line, for what is neither.
     """
     if not path.with_name("reduced.npz").is_file():
-        recover_to(folder, calibration.open_captures(path))
+        recover_to(folder, calibration.HadamardCaptures.load(path))
         path = folder / "matrix.zarr"
     matrix = open_matrix(path)
     return matrix, ReducedMatrix.load(path.with_name("reduced.npz"), matrix)

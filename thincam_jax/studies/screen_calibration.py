@@ -133,12 +133,12 @@ def measure_matrix(
     frame = full // system.out_shape[-1], system.out_shape[-1]  # channels one below the other
     measured = []
     for number in range(math.prod(system.in_shape) // cells):  # patterns of each primary
-        kept = (lit[2] // cells == number) & (lit[1] < full)
+        bits, kept = calibration.bits, (lit[2] // cells == number) & (lit[1] < full)
         values, rows, columns = (part[kept] for part in lit)
         table = scipy.sparse.csr_array((values, (rows, columns % cells)), (full, cells))
         name = f"captures-{float(plane.distance):g}mm{f'-{number}' if number else ''}.zarr"
         with _store(folder, name, calibration) as path:
-            with measuring.create_captures(path, series, frame, bits=calibration.bits) as writer:
+            with measuring.HadamardCaptures.create(path, series, frame, bits=bits) as writer:
                 captures = measuring.simulate_captures(
                     writer,
                     Scaled(Sparse(table, plane.shape, frame), counts),
@@ -343,7 +343,7 @@ class CalibrationRun:
             self.measured.matrix,  # pyright: ignore[reportArgumentType]
             self._assumed(),
             study.plane,
-            self.calibration.fitted,
+            parameters=self.calibration.fitted,
             orders=study.orders,
             samples=study.band_samples,
         )
@@ -380,7 +380,9 @@ class CalibrationRun:
         true = there.system(study.models[0])
         captures, solver = there.captured_through(true), list(study.solvers.values())[-1]
         fitted = self.fit.system(plane)
-        assumed = wg.system_operator(self._assumed(), plane, study.orders, study.band_samples)
+        assumed = wg.system_operator(
+            self._assumed(), plane, orders=study.orders, samples=study.band_samples
+        )
         assert isinstance(fitted.operator, Sparse)
         ways: dict[str, Callable[[], SystemMatrix]] = {
             "exact model": partial(SystemMatrix.of, true),
@@ -440,6 +442,6 @@ def _true_values(study: ScreenStudy) -> dict[str, float]:
         "plate_x": float(camera.tilt[0]),
         "plate_y": float(camera.tilt[1]),
         "object_distance": float(plane.distance),
-        "object_x": float(plane.centre[0]),
-        "object_y": float(plane.centre[1]),
+        "object_x": float(plane.centre[1]),
+        "object_y": float(plane.centre[0]),
     }

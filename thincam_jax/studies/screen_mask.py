@@ -145,10 +145,10 @@ def require_mask_fits(
 def field_points(
     shape: tuple[int, int], pitch: Float[Array, ""], count: int | None = None
 ) -> Float[Array, "y x 2"]:
-    """First images, (x, y) mm, of all samples of a field, or of `count` along each side."""
+    """First images, (y, x) mm, of all samples of a field, or of `count` along each side."""
     ends = [(n - 1) / 2 * float(pitch) for n in shape]
     y, x = (np.linspace(-e, e, count or n) for e, n in zip(ends, shape, strict=True))
-    return jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1), pitch.dtype)
+    return jnp.asarray(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1), pitch.dtype)
 
 
 def first_image(
@@ -162,18 +162,20 @@ def first_image(
     **Errors**: ValueError where the screen does not show the whole plane.
     """
     pitch = camera.sensor.pitch
-    half = np.array([1.0, plane.shape[0] / plane.shape[1]]) * float(plane.width) / 2
+    half = np.array([plane.shape[0] / plane.shape[1], 1.0]) * float(plane.width) / 2
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
     edge, scale = np.asarray(plane.centre) + half * around, float(seen_size(camera, plane) / pitch)
     places = np.zeros_like(edge)
     for _ in range(_STEPS):
-        seen = wg.trace(camera, jnp.asarray(places, pitch.dtype), plane.distance, 1).points[0]
-        places = places + (np.asarray(seen)[:, :2] - edge) / scale
-    rows, columns = np.abs(places).max(axis=0)[::-1] / float(pitch)
+        seen = wg.trace(
+            camera, jnp.asarray(places, pitch.dtype), object_distance=plane.distance, orders=1
+        ).points[0]
+        places = places + (np.asarray(seen)[:, 1::-1] - edge) / scale
+    rows, columns = np.abs(places).max(axis=0) / float(pitch)
     if not max(rows, columns) < 4096:
         raise ValueError("the object reaches beyond what the screen shows; give a smaller width")
     field = 2 * math.ceil(rows), 2 * math.ceil(columns)
-    rays = wg.trace(camera, field_points(field, pitch), plane.distance, 1)
-    smeared = SmearedRays(rays.points[..., None, :2], jnp.ones_like(rays.weight))
+    rays = wg.trace(camera, field_points(field, pitch), object_distance=plane.distance, orders=1)
+    smeared = SmearedRays(rays.points[..., None, 1::-1], jnp.ones_like(rays.weight))
     size = float(pitch) * float(np.ptp(edge) / np.ptp(places))
     return system_matrix(smeared, plane, size, 1.0), field

@@ -9,7 +9,7 @@ from thincam_jax.waveguide.colours import ColourBand as ColourBand
 from thincam_jax.waveguide.colours import ColourCamera as ColourCamera
 from thincam_jax.waveguide.distance import distance_from_ghosts as distance_from_ghosts
 from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram
-from thincam_jax.waveguide.planning import plan as plan
+from thincam_jax.waveguide.planning import plan_screen as plan_screen
 from thincam_jax.waveguide.rays import check_screen as check_screen
 from thincam_jax.waveguide.rays import trace as trace
 from thincam_jax.waveguide.system import LitPlane as LitPlane

@@ -22,17 +22,17 @@ from thincam_jax.waveguide.hologram import VolumeHologram
 
 
 class Rectangle(Module):
-    """A part of a plane: `centre` and `size` (x, y), mm."""
+    """A part of a plane: `centre` and `size` (y, x), mm."""
 
     centre: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
     size: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
 
     def __check_init__(self):
         if not checks.is_traced(self.size) and not (self.size > 0).all():
-            raise ValueError(f"size = {self.size} mm; give a width and a height above 0")
+            raise ValueError(f"size = {self.size} mm; give a height and a width above 0")
 
     def holds(self, points: Float[Array, "*point 2"]):
-        """Whether points (x, y), mm, lie in it."""
+        """Whether points (y, x), mm, lie in it."""
         return (abs(points - self.centre) <= self.size / 2).all(axis=-1)
 
 

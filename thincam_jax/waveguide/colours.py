@@ -150,7 +150,7 @@ class ColourCamera(Module):
         self, tangential: Numbers, wavelength: Numbers
     ) -> Float[Array, "grating *ray"]:
         """C of each, unpolarised, for light from air with direction cosines (x, y)."""
-        across = checks.points("tangential", tangential)
+        across = checks.points("tangential", tangential, "direction cosines (x, y)")
         wave = jnp.asarray(checks.wavelengths("wavelength", wavelength), across.dtype)
 
         def one(number, grating):
@@ -211,7 +211,7 @@ def _one(camera, pixel, distance, out, counts):
         arrives = jnp.mean(coupled * passed, axis=1) * met * sound
         ends = straight + on_object(own, slope, start + odd * bounce)
         # The colours of each part are means as its place is.
-        columns = jnp.concatenate([ends, of_all], axis=-1)
+        columns = jnp.concatenate([ends[..., ::-1], of_all], axis=-1)
         parts, total = jax.vmap(equal_parts, (0, 0, None))(arrives, columns, samples)
         return (1 - met * (1 - kept)) * passed, (parts, total[:, None, None])
 

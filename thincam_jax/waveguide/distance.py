@@ -78,6 +78,7 @@ class GhostDistance:
 def distance_from_ghosts(
     camera: SeeThroughCamera,
     capture: Numbers,
+    *,
     nearest: Number = 200.0,
     farthest: Number = 2000.0,
     orders: int = 4,
@@ -131,7 +132,7 @@ def distance_from_ghosts(
     )
     screen = wg.Screen(hologram, glass_thickness=5.0, glass_index=1.5)
     camera = wg.SeeThroughCamera(screen, tc.Sensor((44, 36), 48 * um), 6.0, 10.0)
-    plane = wg.ObjectPlane((80, 80), distance=430.0, width=250.0, centre=(0.0, 60.0))
+    plane = wg.ObjectPlane((80, 80), distance=430.0, width=250.0, centre=(60.0, 0.0))
     picture = jnp.asarray(resize(sample_image("camera", linear=True), (80, 80)), jnp.float32)
     capture = wg.system_operator(camera, plane)(picture)
     found = wg.distance_from_ghosts(camera, np.asarray(capture), nearest=300.0, farthest=1000.0)
@@ -197,7 +198,9 @@ def _search(camera: SeeThroughCamera, ends: tuple[float, float], orders: int) ->
             f"the sensor has {camera.sensor.shape} pixels; give at least {_LEAST} in each direction"
         )
     check_screen(camera)
-    weight = np.asarray(trace(camera, pixel_centres(camera), ends[0], orders).weight, float)
+    weight = np.asarray(
+        trace(camera, pixel_centres(camera), object_distance=ends[0], orders=orders).weight, float
+    )
     lit = weight[0] > 1e-3 * weight[0].max()
     near, far = (_places(camera, end, 2)[0] for end in ends)
     moved = float(np.median(np.linalg.norm(near - far, axis=-1)[lit]))
@@ -235,7 +238,7 @@ def _places(camera: SeeThroughCamera, distance: float, orders: int) -> np.ndarra
     pixels = pixel_centres(camera)
     found = np.asarray(_sources(camera, pixels, jnp.asarray(distance, pixels.dtype), orders), float)
     middle = (np.array(camera.sensor.shape) - 1) / 2
-    return found[..., ::-1] / float(camera.sensor.pitch) + middle
+    return found / float(camera.sensor.pitch) + middle
 
 
 @eqx.filter_jit

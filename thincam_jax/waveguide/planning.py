@@ -43,8 +43,8 @@ _SHARES = {"orders": 0.4, "crosstalk": 0.6, "smear": 0.6, "dispersion": 0.4, "pr
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Model of a screen's capture within a tolerance; made by `waveguide.plan`.
+class ScreenPlan:
+    """Model of a screen's capture within a tolerance; by `plan_screen`.
 
     Print it for a table. It holds for images like the one that it was made for.
 
@@ -115,12 +115,12 @@ class Plan:
             return _separable(camera, plane, float(seen_size(camera, plane)), counts, level)
 
 
-def plan(
+def plan_screen(
     camera: SeeThroughCamera | ColourCamera,
     scene: LitPlane | Sequence[LitPlane],
     *,
     tolerance: float,
-) -> Plan:
+) -> ScreenPlan:
     r"""Choose the cheapest model of the capture of a scene to a relative error.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
@@ -149,7 +149,7 @@ def plan(
     require_same("planes", "cells", [one.plane.shape for one in lit])
     plane = scene.plane if isinstance(scene, LitPlane) else tuple(one.plane for one in lit)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
-        raise TypeError("plan needs known numbers: call it outside of jit and grad")
+        raise TypeError("plan_screen needs known numbers: call it outside of jit and grad")
     channels = (camera.channels[1],) if isinstance(camera, ColourCamera) else ()
     if any(one.image.shape[:-2] != channels for one in lit) or len(lit) > 1 and channels:
         shapes = [one.image.shape for one in lit]
@@ -272,14 +272,14 @@ class _Probe:
     def _lit(self, pixels: np.ndarray, number: int) -> np.ndarray:
         """About how much light of a plane each pixel gets in all orders together, relative."""
         plane = self.planes[number]
-        rays = trace(self.camera, jnp.asarray(pixels), plane.distance, 2)
-        first, second = np.asarray(rays.points[..., :2], float)
+        rays = trace(self.camera, jnp.asarray(pixels), object_distance=plane.distance, orders=2)
+        first, second = np.asarray(rays.points[..., 1::-1], float)
         order = np.arange(_ORDERS[-1])[:, None]
         points = first + order[..., None] * (second - first)
         light = np.sum(np.abs(self._radiance(points, number)) / (1 + order) ** 1.5, axis=0)
         return np.where(rays.status[0] == RayStatus.OK, light, 0)
 
-    def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
+    def plan(self, camera, plane, tolerance: float, share: float) -> ScreenPlan:
         """The cheapest decisions, each within its part of the remaining tolerance."""
         left, shares, found = tolerance * share / _MARGIN, {}, self.reference.sum(axis=0)
         way: dict[str, Any] = {name: values[-1] for name, values in self.options.items()}
@@ -295,7 +295,7 @@ class _Probe:
         simpler = self.simpler(way, shares["precision"])
         apart = simpler.get("separable", math.inf)
         apart_serves = len(self.planes) == 1 and apart <= tolerance
-        return Plan(
+        return ScreenPlan(
             camera=camera,
             plane=plane,
             tolerance=tolerance,
@@ -338,12 +338,12 @@ class _Probe:
         """The capture with rows and columns separated."""
         column, row = _cross(self.camera)
         down, across = self.pixels.copy(), self.pixels.copy()
-        down[:, 0], across[:, 1] = column, row
+        down[:, 1], across[:, 0] = column, row
         vertical, horizontal = (
             self.rays(dispersion, "float64", samples, places) for places in (down, across)
         )
         points = vertical.points.copy()
-        points[..., 0] = _mean_x(horizontal, orders)[None, :, None]
+        points[..., 1] = _mean_x(horizontal, orders)[None, :, None]
         return self.seen(_Rays(points, vertical.weight), orders).sum(axis=0)
 
     def _shift_invariant(self, dispersion: bool, samples: int | None, orders: int):
@@ -401,13 +401,13 @@ def _separable(camera, plane, size, counts, level) -> Separable:
     """Rows with the ghosts of one column of pixels, columns with the mean shift of one row."""
     grid, (column, row) = camera.sensor.grid, _cross(camera)
     vertical = smeared_rays(
-        camera, jnp.stack([jnp.full_like(grid.y, column), grid.y], -1), plane, *counts
+        camera, jnp.stack([grid.y, jnp.full_like(grid.y, column)], -1), plane, *counts
     )
     horizontal = smeared_rays(
-        camera, jnp.stack([grid.x, jnp.full_like(grid.x, row)], -1), plane, *counts
+        camera, jnp.stack([jnp.full_like(grid.x, row), grid.x], -1), plane, *counts
     )
     x = _mean_x(_as_numpy(horizontal), counts[0])
-    places = np.stack([x, np.full_like(x, float(plane.centre[1]))], axis=-1)
+    places = np.stack([np.full_like(x, float(plane.centre[0])), x], axis=-1)
     right = _overlaps(places[None, :, None], plane, size, 1)[0, :, 0]
     left = _overlaps(np.asarray(vertical.points), plane, size, 0)
     weight = np.asarray(vertical.weight, float)[..., None] / level
@@ -436,7 +436,7 @@ def _cross(camera) -> tuple[float, float]:
 
 def _mean_x(rays: _Rays, orders: int):
     """Where a pixel's light comes from along x, the mean over orders and colours."""
-    weight, x = rays.weight[:orders], rays.points[:orders, ..., 0].mean(axis=-1)
+    weight, x = rays.weight[:orders], rays.points[:orders, ..., 1].mean(axis=-1)
     total = weight.sum(axis=0)
     return (weight * x).sum(axis=0) / np.where(total > 0, total, 1)
 
@@ -446,7 +446,7 @@ def _as_numpy(rays: SmearedRays) -> _Rays:
 
 
 def _spread(camera) -> np.ndarray:
-    """Pixels (x, y), mm, each at random in its own part of the sensor."""
+    """Pixels (y, x), mm, each at random in its own part of the sensor."""
     pixels = np.asarray(pixel_centres(camera), float)
     counts = [min(n, most) for n, most in zip(camera.sensor.shape, _POOL, strict=True)]
     random = np.random.default_rng(0)
@@ -478,9 +478,9 @@ def _drawn(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _orders_seen(camera, plane, pixels) -> np.ndarray:
     """Number of orders, for each pixel, beyond which every ghost has left the object."""
-    rays = trace(camera, jnp.asarray(pixels), plane.distance, 2)
-    first, second = np.asarray(rays.points[..., :2], float)
-    half = float(plane.pitch) * np.asarray(plane.shape[::-1]) / 2 + float(seen_size(camera, plane))
+    rays = trace(camera, jnp.asarray(pixels), object_distance=plane.distance, orders=2)
+    first, second = np.asarray(rays.points[..., 1::-1], float)
+    half = float(plane.pitch) * np.asarray(plane.shape) / 2 + float(seen_size(camera, plane))
     steps = second - first
     # Of the band, light near the critical angle goes three quarters of the way and less.
     ahead = np.asarray(plane.centre) + np.sign(steps) * half - first

@@ -9,6 +9,8 @@ object point of order i, of 2i total reflections, is then
 
 without any angle, so that it has gradients on the axis too. Of a tilted plate **t** and **p** are
 in its own axes, and what it moves a ray sideways is brought to the object along the ray.
+
+Places on a plane are (y, x), as everywhere; vectors in space and direction cosines (x, y, z).
 """
 
 import enum
@@ -41,7 +43,7 @@ class RayStatus(enum.IntEnum):
 class Rays(eqx.Module):
     """Rays of all pixels and orders.
 
-    - `points`: where they meet the object's plane, (order, *pixel, 3), mm. Finite for every status.
+    - `points`: (x, y, z) on the object's plane, mm, (order, *pixel, 3). Finite for every status.
     - `wavelength`: the Bragg wavelength, (*pixel), mm.
     - `weight`: ∫ η²(1−η)^m dλ with m earlier contacts with the hologram, (order, *pixel), mm; 0 for
       rays that are not OK.
@@ -60,6 +62,7 @@ class Rays(eqx.Module):
 def trace(
     camera: SeeThroughCamera,
     pixels: Numbers,
+    *,
     object_distance: Number,
     orders: int = 4,
     extent: Rectangle | None = None,
@@ -68,10 +71,10 @@ def trace(
 
     **Arguments**
 
-    - `pixels`: (x, y) on the sensor, mm from its middle: (*pixel, 2).
+    - `pixels`: (y, x) on the sensor, mm from its middle: (*pixel, 2).
     - `object_distance`: d2, from the plate's front surface, mm; of several planes by `jax.vmap`.
     - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
-    - `extent`: limits of the object, (x, y) mm from the camera's axis; None is infinite.
+    - `extent`: limits of the object, (y, x) mm from the camera's axis; None is infinite.
 
     The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg
     wavelength of each pixel; the weights include the rest of the band, but not its smear.
@@ -109,9 +112,8 @@ def _trace(
         contacts = jnp.asarray(on_bottom).astype(int)
         weight = jnp.take_along_axis(weight, jnp.cumsum(contacts, axis=0) - contacts, axis=0)
     end = camera.focal_distance + camera.lens_distance + screen.glass_thickness + distance
-    points = jnp.concatenate(
-        [ended, jnp.broadcast_to(end, (*ended.shape[:-1], 1)).astype(ended.dtype)], axis=-1
-    )
+    depth = jnp.broadcast_to(end, (*ended.shape[:-1], 1)).astype(ended.dtype)
+    points = jnp.concatenate([ended[..., ::-1], depth], axis=-1)
     return Rays(points, wavelength, jnp.where(status == RayStatus.OK, weight, 0), guided, status)
 
 
@@ -135,9 +137,9 @@ class BraggRays(eqx.Module):
 
 
 def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> BraggRays:
-    """Rays from pixels, (x, y) mm, through lens and rear surface to the top hologram."""
+    """Rays from pixels, (y, x) mm, through lens and rear surface to the top hologram."""
     hologram = camera.screen.hologram
-    axes, slope = camera.plate_axes, -pixels / camera.focal_distance
+    axes, slope = camera.plate_axes, -pixels[..., ::-1] / camera.focal_distance
     across = product(slope, axes[:2, :2]) + axes[2, :2]
     across = across / jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True) + 1)
     wavelength, matched = hologram.bragg_wavelength(across)
@@ -160,9 +162,9 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
     return BraggRays(slope, across, wavelength, guided, left, fault)
 
 
-class Path(eqx.Module):
+class RayPath(eqx.Module):
     """Where rays meet the top hologram, (*pixel, 2), the bottom one and the object's plane, (order,
-    *pixel, 2), (x, y) mm."""
+    *pixel, 2), (y, x) mm."""
 
     top: Float[Array, "*pixel 2"]
     bottom: Float[Array, "order *pixel 2"]
@@ -171,7 +173,7 @@ class Path(eqx.Module):
 
 def object_points(
     camera: SeeThroughCamera, rays: BraggRays, distance: Float[Array, ""], orders: int
-) -> Path:
+) -> RayPath:
     """Paths from the lens to the object, for each order."""
     width = camera.screen.glass_thickness
     bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
@@ -180,7 +182,8 @@ def object_points(
     odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
     guided = jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
     moved = on_object(camera, rays.slope, guided + 2 * width * crossing)
-    return Path(top, top + guided, straight_on(camera, rays.slope, distance) + moved)
+    places = top, top + guided, straight_on(camera, rays.slope, distance) + moved
+    return RayPath(*(place[..., ::-1] for place in places))
 
 
 def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:
@@ -217,10 +220,9 @@ def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
 
 @checked
 def pixel_centres(camera: SeeThroughCamera) -> Float[Array, "y x 2"]:
-    """Where the sensor's pixels are, (x, y) mm."""
+    """Where the sensor's pixels are, (y, x) mm."""
     grid = camera.sensor.grid
-    y, x = jnp.meshgrid(grid.y, grid.x, indexing="ij")
-    return jnp.stack([x, y], axis=-1)
+    return jnp.stack(jnp.meshgrid(grid.y, grid.x, indexing="ij"), axis=-1)
 
 
 @checked
@@ -250,7 +252,7 @@ def check_screen(camera: SeeThroughCamera) -> None:
             f"light is diffracted to Θ' = {angle:.2f}° in the glass, under the critical angle of "
             f"{critical:.2f}° (n = {index:.4g}), and leaves it; give a larger reference angle"
         )
-    bounce = 2 * float(screen.glass_thickness) * guided / float(middle.left) ** 0.5
+    bounce = 2 * float(screen.glass_thickness) * guided[::-1] / float(middle.left) ** 0.5
     for name, hologram in (("top", screen.top), ("bottom", screen.bottom)):
         if hologram is not None and bool(jnp.any(hologram.size < jnp.abs(bounce))):
             size, step = (

@@ -49,7 +49,7 @@ _STEPS = 5
 class GhostImages(eqx.Module):
     """The images of object points by each order, through the middle of the mask.
 
-    - `places`: (x, y) on the sensor, mm, (order, *point, 2).
+    - `places`: (y, x) on the sensor, mm, (order, *point, 2).
     - `wavelength`: λ_C, mm, (order, *point).
     - `distance`: T of the virtual source from the mask, mm, the mean of x and y, (order, *point).
     - `weight`: W_i times the ratio of determinants, mm of bandwidth, (order, *point); 0 where a ray
@@ -75,7 +75,7 @@ def ghost_images(
 
     - `camera`: with the mask's middle in place of the lens: `focal_distance` is d, and
       `lens_distance` the gap between mask and plate.
-    - `field`: the points, given by their first images, (x, y) on the sensor, mm.
+    - `field`: the points, given by their first images, (y, x) on the sensor, mm.
     - `object_distance`: from the plate's front surface, mm.
     """
     checks.at_least_one({"orders": orders})
@@ -112,7 +112,7 @@ def _ghost_images(
     places, slopes, area = jax.vmap(one, out_axes=(1, 1, 0))(field.reshape(-1, 2))
     depth = -camera.focal_distance * jnp.trace(slopes, axis1=-2, axis2=-1) / 2
     area = area / jnp.linalg.det(slopes - jnp.eye(2, dtype=slopes.dtype))
-    rays = trace(camera, places, distance, orders)
+    rays = trace(camera, places, object_distance=distance, orders=orders)
     weight = jnp.where(rays.status[own, own] == RayStatus.OK, rays.weight[own, own], 0) * area
     shape = (orders, *field.shape[:-1])
     return GhostImages(
@@ -133,7 +133,7 @@ def ghost_psfs(images: GhostImages, mask_psf: MaskPsf) -> Float[Array, "*point k
     by `images.weight.sum(axis=0)` of the axis for PSFs relative to an open screen.
     """
     orders, *shape = images.weight.shape
-    shifts = (images.places - images.places[:1]).reshape(orders, -1, 2)[..., ::-1]
+    shifts = (images.places - images.places[:1]).reshape(orders, -1, 2)
     parts = images.wavelength, images.distance, images.weight
     flat = [part.reshape(orders, -1) for part in parts]
 

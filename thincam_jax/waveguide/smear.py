@@ -26,7 +26,7 @@ from thincam_jax.waveguide.rays import RayStatus, at_rear, bragg_rays, on_object
 class SmearedRays(eqx.Module):
     """Object points of a pixel's light, by order.
 
-    - `points`: (x, y) on the object's plane, mm, of equal parts of the light, (order, *pixel,
+    - `points`: (y, x) on the object's plane, mm, of equal parts of the light, (order, *pixel,
       sample, 2).
     - `weight`: ∫ η²(1−η)^m dλ over the guided light that meets the holograms, (order, *pixel), mm;
       where samples have colours, as many times that of each.
@@ -72,12 +72,12 @@ def _one(camera, pixel, distance, counts):
     def contact(passed, odd):
         met = meets(camera.screen.bottom, top + odd * bounce)
         light = jnp.mean(band.eta**2 * passed, axis=0) * met * sound
-        ends = on_object(camera, rays.slope, odd * bounce + 2 * crossing)
+        ends = on_object(camera, rays.slope, odd * bounce + 2 * crossing)[..., ::-1]
         return (1 - met * band.eta) * passed, equal_parts(light, ends, samples)
 
     odd = 2 * jnp.arange(orders, dtype=sound.dtype) + 1
     _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
-    return straight_on(camera, rays.slope, distance), parts, weight * band.step
+    return straight_on(camera, rays.slope, distance)[::-1], parts, weight * band.step
 
 
 def guided_band(camera: SeeThroughCamera, pixel: Float[Array, "2"], nodes: int):
@@ -105,10 +105,11 @@ def guided_band(camera: SeeThroughCamera, pixel: Float[Array, "2"], nodes: int):
 
 
 def meets(hologram: Rectangle | None, places: Float[Array, "node 2"]) -> Float[Array, " node"]:
-    """Share of the light about each node that meets a hologram."""
+    """Share of the light about each node, at (x, y), that meets a hologram."""
     if hologram is None:
         return jnp.ones(places.shape[0], places.dtype)
-    return _covered(jnp.min(hologram.size / 2 - jnp.abs(places - hologram.centre), axis=-1))
+    away = jnp.abs(places[:, ::-1] - hologram.centre)
+    return _covered(jnp.min(hologram.size / 2 - away, axis=-1))
 
 
 def _covered(margin):

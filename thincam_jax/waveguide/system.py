@@ -26,7 +26,7 @@ class ObjectPlane(Module):
     - `shape`: (rows, columns) of cells.
     - `distance`: d2, from the plate's front surface, mm.
     - `width`: width of the object, mm.
-    - `centre`: (x, y) of its middle from the camera's axis, mm; +y is down.
+    - `centre`: (y, x) of its middle from the camera's axis, mm; +y is down.
     """
 
     shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
@@ -67,7 +67,7 @@ class Footprints:
 
 
 def footprints(points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane, size: float) -> Footprints:
-    """Overlaps of the cells with squares of the given size, mm, about points (x, y)."""
+    """Overlaps of the cells with squares of the given size, mm, about points (y, x)."""
     pitch = float(plane.pitch)
     ratio = size / pitch
     if not 0 < ratio < 64:
@@ -93,9 +93,9 @@ def entries_of_a_ray(camera: SeeThroughCamera, plane: ObjectPlane) -> int:
 def in_cells(
     points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane
 ) -> Float[np.ndarray, "2 *ray"]:
-    """Points (x, y), mm, as rows and columns of cells from the object's corner, in float64."""
-    numbers, centre = np.asarray(plane.shape, float), np.asarray(plane.centre, float)[::-1]
-    places = (points[..., ::-1].astype(float) - centre) / float(plane.pitch) + numbers / 2
+    """Points (y, x), mm, as rows and columns of cells from the object's corner, in float64."""
+    numbers, centre = np.asarray(plane.shape, float), np.asarray(plane.centre, float)
+    places = (points.astype(float) - centre) / float(plane.pitch) + numbers / 2
     return np.moveaxis(places, -1, 0)
 
 
@@ -114,13 +114,14 @@ def smeared_rays(
     """`trace_band`, or for None `trace` as one sample at the Bragg wavelength."""
     if samples is not None:
         return trace_band(camera, pixels, plane.distance, orders, samples)
-    rays = trace(camera, pixels, plane.distance, orders)
-    return SmearedRays(rays.points[..., None, :2], rays.weight)
+    rays = trace(camera, pixels, object_distance=plane.distance, orders=orders)
+    return SmearedRays(rays.points[..., None, 1::-1], rays.weight)
 
 
 def system_operator(
     camera: SeeThroughCamera | Sequence[SeeThroughCamera],
     plane: ObjectPlane | Sequence[ObjectPlane],
+    *,
     orders: int = 4,
     samples: int | None = None,
 ) -> Sparse:
@@ -152,7 +153,9 @@ def system_operator(
     sensors of different pixels, and for cells below a 64th of a pixel's field.
     """
     if isinstance(camera, list | tuple):
-        return colour_operator([system_operator(c, plane, orders, samples) for c in camera])
+        return colour_operator(
+            [system_operator(c, plane, orders=orders, samples=samples) for c in camera]
+        )
     if not isinstance(camera, SeeThroughCamera):
         raise TypeError(f"camera is {checks.shown(camera)}; give a waveguide.SeeThroughCamera")
     return planes_operator(camera, plane, (orders, samples))

@@ -48,7 +48,7 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
     for args in (("capture", file, "--out", store), ("run", store, "--out", out)):
         result = call(*args)
         assert result.exit_code == 0, result.output
-    found = Alignment.read(out / "alignment.json")
+    found = Alignment.load(out / "alignment.json")
     assert found.used == 9
     angles = {"rotation": 3 * deg, "turn": 6 * deg}
     matrix = MonitorPose(x=2.0, y=-1.5, z=2.0, **angles).homography(250.0)

@@ -14,7 +14,7 @@ from commands.test_cli import call, one_line
 from thincam_jax.commands.capture.command import virtual_rig
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 
 COLOURS = yaml.safe_load(tiny.METHOD_B)
 COLOURS["camera"] |= {
@@ -39,7 +39,7 @@ def test_a_colour_image_of_mosaics_agrees_with_direct_simulation(file, tmp_path)
     for args in (("capture", file, "--out", store), ("run", store, "--out", out)):
         result = call(*args)
         assert result.exit_code == 0, result.output
-    assert read_acquisition(store).settings[0].bayer == "GBRG"
+    assert Acquisition.load(store).settings[0].bayer == "GBRG"
     found = json.loads((out / "metrics.json").read_text("utf-8"))
     agreement, scores = found["agreement"], found["psnr_db"]
     for residual, bias in zip(

@@ -23,7 +23,7 @@ from thincam_jax.commands.capture import command
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.hardware import registry
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.displays.patterns import pattern_levels
 from thincam_jax.hardware.registry import driver_report
 from thincam_jax.hardware.virtual import devices
@@ -112,7 +112,7 @@ def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, 
     file = tiny.write(tmp_path, yaml.safe_dump(raw))
     result = call("capture", file, "--out", tmp_path / "a.zarr")
     assert result.exit_code == 0, result.output
-    taken = read_acquisition(tmp_path / "a.zarr")
+    taken = Acquisition.load(tmp_path / "a.zarr")
     seen = set()
     for number, step in enumerate(taken.plan.steps):
         fiducial = read_fiducial(taken.frame(number), taken.bits)
@@ -130,7 +130,7 @@ def test_a_store_is_not_written_over_and_a_missing_one_begun(method_b, tmp_path)
     assert "exists; --resume goes on" in one_line(call("capture", file, "--out", store))
     begun = call("capture", file, "--out", tmp_path / "b.zarr", "--resume")
     assert begun.exit_code == 0, begun.output
-    assert read_acquisition(tmp_path / "b.zarr").plan == read_acquisition(store).plan
+    assert Acquisition.load(tmp_path / "b.zarr").plan == Acquisition.load(store).plan
     other = call("capture", file, "--out", store, "--resume", "--set", "plan.dark_frames=1")
     assert "another plan" in one_line(other)
     assert call("capture", file, "--out", store, "--resume").exit_code == 0  # complete already
@@ -158,7 +158,7 @@ def test_after_ctrl_c_the_store_is_kept_and_goes_on(method_b, tmp_path, monkeypa
     assert "interrupted; 3 of 6 frames are kept; go on with: thincam capture" in line
     assert line.endswith(f"--out {store} --resume")
     assert call("capture", file, "--out", store, "--resume").exit_code == 0
-    first, second = read_acquisition(whole), read_acquisition(store)
+    first, second = Acquisition.load(whole), Acquisition.load(store)
     steps = range(len(first.plan.steps))
     assert all(np.array_equal(first.frame(n), second.frame(n)) for n in steps)
 
@@ -171,7 +171,7 @@ def test_the_exposure_is_found_before_the_first_frame_and_kept(tmp_path):
     file, store = tiny.write(tmp_path, yaml.safe_dump(raw)), tmp_path / "a.zarr"
     result = call("capture", file, "--out", store)
     assert result.exit_code == 0, result.output
-    taken = read_acquisition(store)
+    taken = Acquisition.load(store)
     exposure = taken.settings[0].exposure
     assert f"6 frames; exposure {1000 * exposure:.4g} ms; next: thincam run" in " ".join(
         result.stdout.split()
@@ -180,7 +180,7 @@ def test_the_exposure_is_found_before_the_first_frame_and_kept(tmp_path):
     assert exposure < 0.1 and level == pytest.approx(0.7, rel=0.15)
     assert all(shot["exposure"] == pytest.approx(exposure, rel=1e-3) for shot in taken.shots)
     assert call("capture", file, "--out", store, "--resume").exit_code == 0
-    assert read_acquisition(store).settings[0].exposure == exposure
+    assert Acquisition.load(store).settings[0].exposure == exposure
 
 
 def test_an_error_of_a_device_is_one_line_and_how_to_go_on(tmp_path):
@@ -238,8 +238,6 @@ def test_the_limits_of_a_rig_hold_for_the_whole_plan_before_the_first_frame(aske
         ("virtual=null", "virtual: rig: virtual needs this section"),
         ("targets=[]", "targets: a virtual rig looks at one; give it"),
         ("optics=null", "optics: a plan of kind method_b needs optics"),
-        ("camera.exposure=20", "camera.exposure: 20 has no unit"),
-        ("acquisition.exposure=found", "'found' is unknown; choose one of 'given' or 'auto'"),
     ],
 )
 def test_a_file_that_does_not_fit_together(asked, line, tmp_path):
@@ -312,7 +310,7 @@ def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch)
     file = tiny.write(tmp_path)
     result = call("capture", file, "--out", tmp_path / "a.zarr", *sets)
     assert result.exit_code == 0, result.output
-    taken = read_acquisition(tmp_path / "a.zarr")
+    taken = Acquisition.load(tmp_path / "a.zarr")
     assert taken.provenance["devices"]["camera"]["vendor"] == "Elsewhere"
     assert taken.frame(taken.lit[0]).max() > 100
 

@@ -54,7 +54,7 @@ OTHER = "{phases: [0 rad, 6.26 rad], wavelength: 532 nm}"
 
 def test_a_table_of_a_file_is_the_same_and_another_one_another_plan(file, tmp_path):
     table = PhaseLevels(PHASES, 532e-6, gap=0.5)
-    table.write(tmp_path / "slm.json")
+    table.save(tmp_path / "slm.json")
     here, there = (
         loaded(file, *sets) for sets in ((), (f"display.phase_levels={tmp_path / 'slm.json'}",))
     )

@@ -66,7 +66,7 @@ def test_the_table_of_grey_levels_of_a_linear_display(file):
     for args in (("capture", file, "--out", store, *sets), ("run", store, "--out", out)):
         result = call(*args)
         assert result.exit_code == 0, result.output
-    levels = GreyLevels.read(out / "grey_levels.json")
+    levels = GreyLevels.load(out / "grey_levels.json")
     assert np.abs(levels.table.astype(int) - np.arange(256)).max() <= 2
     assert levels.provenance["frames"] == 2
     table = f"display.options.grey_levels={out / 'grey_levels.json'}"

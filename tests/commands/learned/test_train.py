@@ -11,7 +11,7 @@ from helpers import ROOT
 from thincam_jax.commands import cli
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera, build_lessons
+from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera
 from thincam_jax.learn.refocusing.store import described, load
 from thincam_jax.learn.refocusing.train import NETWORK
 
@@ -102,13 +102,6 @@ def test_a_fault_of_the_file_is_told(changed, told, file):
 def test_a_file_of_another_kind_is_told_as_that_alone():
     told = line(call(ROOT / "configs" / "fza_refocus.yaml"))
     assert told.endswith(".yaml: is a refocusing; give it to 'thincam run'")
-
-
-def test_a_folder_that_is_not_there_is_told(file):
-    source = "sources.0={name: mine, kind: folder, path: nowhere}"
-    config = load_as(LearnedConfig, file, (source,))
-    with pytest.raises(ConfigError, match=r"sources\[0\]: .*nowhere' is no folder"):
-        build_lessons(config)
 
 
 def test_the_shipped_file_is_whole():

@@ -282,16 +282,11 @@ class TestExitCode2:
             (("--method", "poisson"), "method 'poisson' needs raw counts"),
             (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave it out"),
             (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
-            (("--method", "ridge", "--ridge", 0), "ridge = 0.0 is not positive"),
             (("--method", "pnp", "--tau", 2), "method 'pnp' cannot use tau; leave it out, or use"),
             (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave it out, or use 'ridge'"),
-            (("--tau", -1), "tau = -1.0 is negative"),
-            (("--tau", "nan"), "tau is NaN"),
-            (("--noise", 0), "noise = 0.0 counts is not positive"),
             (("--tau", 1e30), "tau = 1e+30: give about 1 to 3, at most 1e+06"),
             (("--iterations", 0), "iterations = 0: give at least 1"),
             (("--bits", 8), "above the 255 of 8 bit"),
-            (("--bits", 10), "above the 1023 of 10 bit"),
             (("--background", "none.tif"), "none.tif: does not exist"),
             (("--background", 5000), "is black"),
             (("--dead", "none.png"), "none.png: does not exist"),
@@ -299,7 +294,6 @@ class TestExitCode2:
             (("--white-balance", "1,2"), "--white-balance 1,2: give grey-world, or the gains"),
             (("--white-balance", "1,2,3"), "for 1 channel(s)"),
             (("--gamma", 0), "give a gamma above 0"),
-            (("--saturation", 2), "saturation = 2.0: give a number above 0, up to 1"),
             (("--bayer", "RGGB", "--demosaic", "bilinear", "--capture", "none.tif"), "not exist"),
         ],
     )
@@ -319,8 +313,6 @@ class TestExitCode2:
             ("capture", "cut", "capture.tif: is cut short"),
             ("psf", "text", "psf.tif: is not an image that can be read"),
             ("psf", "smaller", "60×70 pixels and the capture"),
-            ("psf", "colour", "has 3 channels and the capture"),
-            ("psf", "black", "the PSF is black in channel 0"),
             ("capture", "two", "has 2 channels and a PNG shows 1 or 3"),
         ],
     )
@@ -339,9 +331,7 @@ class TestExitCode2:
     def changed(self, pixels, change):
         if change == "smaller":
             return np.ascontiguousarray(pixels[:, 6:])
-        if change == "black":
-            return np.zeros_like(pixels)
-        return np.stack([pixels] * {"colour": 3, "two": 2}[change], axis=-1)
+        return np.stack([pixels] * 2, axis=-1)
 
     @pytest.mark.parametrize(
         ("out", "message"),
@@ -380,13 +370,6 @@ def test_what_help_lists_is_what_can_be_done():
         ("linear", Output, "linear"),
     ):
         assert typed[option] == get_type_hints(record)[field]
-
-
-def test_help():
-    result = runner.invoke(cli.app, ["reconstruct", "--help"])
-    assert result.exit_code == 0
-    for part in ("--psf", "--capture", "--background", "admm-tv", "RGGB", "Ctrl-C"):
-        assert part in result.stdout
 
 
 @pytest.mark.thorough
@@ -494,10 +477,6 @@ def test_advice_on_channels_is_in_options_and_can_be_followed(grey, tmp_path):
         assert one_line(result).endswith(advice)
     followed = check(grey, *small, "--psf-background", 40, *advice.split()[-2:])
     assert "give at least 32 a side" in one_line(followed)
-
-
-def test_check_of_files_too_small_is_one_line(grey):
-    assert "give at least 32 a side" in one_line(check(grey, "--downsample", 2))
 
 
 @pytest.mark.thorough

@@ -11,7 +11,7 @@ from commands.reconstruct.test_command import one_line, record_of, runner
 from measured.test_examination import quality
 
 from thincam_jax.commands import cli
-from thincam_jax.commands.reconstruct.jobs import Rig, plan_jobs
+from thincam_jax.commands.reconstruct.jobs import Inputs, plan_jobs
 from thincam_jax.commands.reconstruct.options import Output, Sources
 from thincam_jax.measured import Raw
 
@@ -153,7 +153,7 @@ class TestHotPixels:
 
     def test_the_difference_to_the_dark_frame_stays(self, hot):
         """Where nothing saturates, and nothing is found any more."""
-        rig = Rig(Sources(hot["psf"], hot["dark"], bits=12))
+        rig = Inputs(Sources(hot["psf"], hot["dark"], bits=12))
         (job,) = plan_jobs(hot["capture"], rig.sources, Output(hot["psf"].with_name("a.npy")))
         examined, dark = rig.examine(job)
         assert not examined.findings and isinstance(dark, Raw)

@@ -109,10 +109,6 @@ def test_base_is_read_in_the_units_of_the_package(tmp_path):
 
 # what is in the file, what it is changed to, the field, what the message must hold
 FAULTS = {
-    "no unit, exponent": ("width: 2 mm", "width: 1e-3", "mask.width", ["1e-3 has no unit"]),
-    "unknown unit": ("pitch: 40 um", "pitch: 40 foo", "sensor.pitch", ['unknown unit "foo"', "nm"]),
-    "YAML NaN": ("width: 80 mm", "width: .nan", "object.width", ["no unit"]),
-    "infinity": ("snr_db: 30", "snr_db: .inf", "noise.snr_db", ["inf: ", "finite number"]),
     "unknown key in a list": (
         *("        distance: 3 mm", "        distance: 3 mm\n        colour: red"),
         *("methods[0].shots[0].colour", ["unknown key; allowed here: beta, distance, wavelength"]),
@@ -121,18 +117,15 @@ FAULTS = {
         *("image: coffee", "image: coffe", "targets[1]"),
         ["image 'coffe' is unknown; choose one of", *sample_images()],
     ),
-    "part of a pixel": ("[48, 64]", "[48, 64.5]", "sensor.shape[1]", ["64.5", "integer"]),
-    "no pixel": ("[48, 64]", "[48, 0]", "sensor.shape", ["shape = (48, 0)", "of at least 1"]),
     "list too short": ("[48, 64]", "[48]", "sensor.shape[1]", ["the list needs this entry"]),
     "list too long": ("[48, 64]", "[48, 64, 3]", "sensor.shape", ["3 entries", "at most 2"]),
     "no phase": (
         *("phases: [0 rad, 270 deg]", "phases: []", "methods[1].phases"),
         ["[] has 0 entries; give at least 1"],
     ),
-    "no target": (
-        BASE[BASE.index("targets:") :],
-        "targets: []",
-        *("targets", ["[] has 0 entries; give at least 1"]),
+    "no wavelength of light": (
+        *("wavelength: 500 nm", "wavelength: 500 m", "wavelength"),
+        ["is no wavelength of light; give 10 nm to 0.1 mm"],
     ),
     "section without a value": (
         *("noise:\n  snr_db: 30", "noise:"),
@@ -151,15 +144,6 @@ FAULTS = {
         "synthesis: separate",
         "synthesis: separate\n    harmonics: [1]",
         *("methods[1].harmonics", ["synthesis separate has none; drop it"]),
-    ),
-    "contrasts of one capture": (
-        *(BASE[BASE.index("synthesis: separate") : BASE.index("targets:")], ONE_SHOT, "methods[1]"),
-        ["contrasts compares captures; give two phases or shots"],
-    ),
-    "contrasts of two distances": (
-        BASE[BASE.index("synthesis: separate") : BASE.index("targets:")],
-        ONE_SHOT + "      - {beta: 25 rad/mm^2, distance: 4 mm}\n",
-        *("methods[1]", ["needs shots at one distance", "use phase_pairs or fringe_scanning"]),
     ),
     "synthesis given to fringe scanning": (
         *("kind: fringe_scanning", "kind: fringe_scanning\n    synthesis: separate"),
@@ -191,7 +175,6 @@ FAULTS = {
         ["'Chart.' and 'chart' of targets[0] give the same file name 'chart'"],
     ),
     "slash in a name": ("name: picture", "name: a/b", "targets[1].name", ["'a/b'", "pattern"]),
-    "empty name": ("name: picture", "name: ''", "targets[1].name", ["''", "at least 1 char"]),
     "two kinds of noise": (
         *("snr_db: 30", "snr_db: 30\n  read_noise: 2", "noise"),
         ["give either snr_db", "or read_noise"],
@@ -234,8 +217,6 @@ LINES = {
     "harmonics of another synthesis": "harmonics: [1",
     "unknown photograph": "- name: picture",
     "phases given to fringe scanning": "- name: wiener",
-    "contrasts of one capture": "- name: wiener",
-    "contrasts of two distances": "- name: wiener",
     "synthesis given to fringe scanning": "- name: scan",
     "the same phase twice": "phases: [0 rad",
     "path for a photograph": "- name: picture",
@@ -265,26 +246,6 @@ def test_unknown_key_lists_the_keys_of_its_section_only(tmp_path):
     allowed = line.split("allowed here: ")[1].split(", ")
     assert allowed[:6] == ["width", "profile", "pixel_pitch", "fill_factor", "height", "harmonics"]
     assert "family" in allowed and "pitch" not in allowed
-
-
-@pytest.mark.parametrize(
-    ("removed", "field", "place"),
-    [
-        ("  pitch: 40 um\n", "sensor.pitch", "sensor:"),
-        ("  width: 2 mm\n", "mask.width", "mask:"),
-        ("    kind: wiener\n", "methods[1].kind", "- name: wiener"),
-        ("        distance: 3 mm\n", "methods[0].shots[0].distance", "- beta: 25"),
-    ],
-)
-def test_missing_key_is_reported_where_its_section_begins(removed, field, place, tmp_path):
-    text = changed(removed, "")
-    (line,) = faults(tmp_path, text)
-    assert line == f"{line_of(text, place)}: {field}: missing; this key is needed"
-
-
-def test_missing_section(tmp_path):
-    (line,) = faults(tmp_path, changed("object:\n  distance: 100 mm\n  width: 80 mm\n", ""))
-    assert line == "1: object: missing; this key is needed"
 
 
 def test_a_faulty_entry_is_not_a_missing_one_too(tmp_path):
@@ -368,16 +329,6 @@ def test_same_shot_twice(tmp_path, extra):
     (line,) = faults(tmp_path, text)
     number = line_of(text, "    synthesis: separate") + 1  # the line of the second 'shots:'
     assert line.startswith(f"{number}: methods[1].shots: shots hold an entry twice")
-
-
-@pytest.mark.parametrize(
-    "override", ["wavelength=500 m", "wavelength=0.2 mm", "wavelength=1e-30 nm"]
-)
-def test_wavelengths_are_those_of_light(tmp_path, override):
-    path = tmp_path / "study.yaml"
-    path.write_text(BASE, encoding="utf-8")
-    with pytest.raises(ConfigError, match="is no wavelength of light; give 10 nm to 0.1 mm"):
-        load_experiment(path, (override,))
 
 
 def test_pictures_are_light_and_pages_show_their_codes(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.sweep.grid import Axis, read_axes
-from thincam_jax.commands.sweep.point import GridPoint, Outcome, make_points
+from thincam_jax.commands.sweep.point import GridPoint, Metrics, make_points
 
 TEXT = """\
 name: mini
@@ -47,16 +47,16 @@ def points(config: StudyConfig, *grid: str, double: bool = False) -> list[GridPo
     return make_points(config, axes(config, *grid), double)
 
 
-def outcome(number: float) -> Outcome:
+def outcome(number: float) -> Metrics:
     """As of a point that was measured."""
-    return Outcome({"psnr_db/single/star": float(number), "seconds": 0.5})
+    return Metrics({"psnr_db/single/star": float(number), "seconds": 0.5})
 
 
 def ignore(ended: int, failed: int) -> None:
     """Progress that nobody watches."""
 
 
-def deadly_measure(text: str, double: bool) -> Outcome:
+def deadly_measure(text: str, double: bool) -> Metrics:
     """In place of `measure_point`: seed 3 kills its worker, 4 raises."""
     seed = json.loads(text)["seed"]
     if seed == 3:

@@ -88,18 +88,14 @@ class TestExitCode2:
     @pytest.mark.parametrize(
         ("options", "part"),
         [
-            ((), "a sweep needs a --grid: write it as path=lo:hi:n"),
-            (("--grid", "seed=0:4:0"), "--grid seed=0:4:0: n is 0"),
             (("--grid", "sed=0:4:5"), "--grid sed=0:4:5: sed: unknown key"),
             (("--grid", "methods.7.name=a"), "methods has no entry 7"),
-            (("--grid", "mask.width=1:2:3"), "mask.width: 1 has no unit: write a length such as"),
             (("--grid", "mask.width=1:2:3 nms"), 'has the unknown unit "nms"'),
             # Of every entry that a * stands for, once.
             (
                 ("--grid", "methods.*.shots.*.beta=7", "--set", f"methods.0.shots={_TWO}"),
                 "methods[0].shots[0].beta and 1 more: 7 has no unit",
             ),
-            (("--grid", "seed=1", "--grid", "seed=2"), "seed is set by --grid seed=1 too"),
             (("--grid", "seed=1", "--workers", 0), "--workers 0: give at least 1"),
             (("--grid", "seed=1", "--workers", 1, "--scheduler", "tcp://a:1"), "leave it out"),
             (("--grid", "seed=1", "--set", "seed=x"), "--set seed=x: seed: 'x'"),
@@ -110,24 +106,10 @@ class TestExitCode2:
         assert part in one_line(call("sweep", file, *options, "--out", out))
         assert not out.exists()
 
-    def test_file(self, tmp_path):
-        missing = tmp_path / "no.yaml"
-        line = one_line(call("sweep", missing, "--grid", "seed=1"))
-        assert line == f"{missing} is missing; give the path of a YAML experiment file"
-
     def test_experiment_of_another_kind(self):
         file = ROOT / "configs" / "fza_refocus.yaml"
         line = one_line(call("sweep", file, "--grid", "seed=1"))
         assert line == f"{file}: is of kind refocus; a sweep takes a study"
-
-    def test_out(self, file, asked, tmp_path):
-        out = tmp_path / "out"
-        assert call("sweep", file, "--grid", "seed=1", "--out", out).exit_code == 0
-        other = ("--grid", "seed=1", "--set", "noise.snr_db=20")
-        line = one_line(call("sweep", file, *other, "--out", out))
-        assert line.startswith(f"--out {out}: holds a sweep of another configuration (see {out}")
-        for path, part in ((tmp_path, "holds no sweep"), (file, "cannot be made a folder")):
-            assert part in one_line(call("sweep", file, "--grid", "seed=1", "--out", path))
 
     def test_scheduler_that_does_not_answer(self, file, tmp_path, monkeypatch):
         monkeypatch.setattr(workers, "_CONNECT_SECONDS", 0.5)
@@ -147,13 +129,6 @@ class TestExitCode2:
             assert one_line(call("sweep", file, "--grid", "seed=1", *options)) == (
                 f"thincam sweep needs {missing}; install them with pip install 'thincam_jax[sweep]'"
             )
-
-
-def test_help():
-    result = call("sweep", "--help")
-    assert result.exit_code == 0
-    for part in ("--grid", "--scheduler", "--workers", "results.parquet", "failures.jsonl"):
-        assert part in result.stdout
 
 
 @pytest.mark.thorough

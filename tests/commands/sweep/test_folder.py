@@ -9,7 +9,7 @@ from commands.sweep import mini
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import load_experiment
-from thincam_jax.commands.sweep.point import Outcome
+from thincam_jax.commands.sweep.point import Metrics
 from thincam_jax.commands.sweep.run import SweepFolder
 
 
@@ -42,7 +42,7 @@ def test_rows_are_in_the_order_of_the_grid_and_failures_apart(folder, config):
     points = mini.points(config, "seed=0:3:4")
     folder.keep(points[2], mini.outcome(20))
     folder.keep(points[0], mini.outcome(10))
-    folder.keep(points[1], Outcome(None, "why", "Traceback"))
+    folder.keep(points[1], Metrics(None, "why", "Traceback"))
     assert [folder.has(point) for point in points] == [True, False, True, False]
     assert count(folder.collect(points)[0]) == 2
     assert [list(row) for row in rows(folder)] == [
@@ -72,7 +72,7 @@ def test_point_kept_twice_is_one_row(folder, config):
 
 def test_failure_goes_when_the_point_succeeds(folder, config):
     points = mini.points(config, "seed=0:1:2")
-    folder.keep(points[0], Outcome(None, "why"))
+    folder.keep(points[0], Metrics(None, "why"))
     assert folder.collect(points) == (None, failures(folder))
     assert not (folder.path / "results.parquet").exists()
     folder.keep(points[0], mini.outcome(1))
@@ -109,8 +109,8 @@ def test_other_grid_takes_the_rows_that_it_shares(folder, config):
 def test_columns_that_some_rows_lack(folder, config):
     """A row without a resolved element, one without a PSNR, values of several kinds."""
     points = mini.points(config, "sensor.bit_depth=null,8", "sensor.exposure=0.9")
-    folder.keep(points[0], Outcome({"psnr_db/a/b": None, "resolved_group/a/b": 0, "seconds": 1.0}))
-    folder.keep(points[1], Outcome({"psnr_db/a/b": None, "seconds": 1.0}))
+    folder.keep(points[0], Metrics({"psnr_db/a/b": None, "resolved_group/a/b": 0, "seconds": 1.0}))
+    folder.keep(points[1], Metrics({"psnr_db/a/b": None, "seconds": 1.0}))
     folder.collect(points)
     first, second = rows(folder)
     assert (first["sensor.bit_depth"], second["sensor.bit_depth"]) == (None, 8)

@@ -18,7 +18,7 @@ from commands.test_cli import call
 
 from helpers import ROOT
 from thincam_jax.commands.sweep import run
-from thincam_jax.commands.sweep.point import Outcome
+from thincam_jax.commands.sweep.point import Metrics
 from thincam_jax.commands.sweep.run import SweepFolder, run_sweep
 from thincam_jax.commands.sweep.workers import Died
 
@@ -61,7 +61,7 @@ def failures(path):
 def test_finished_points_are_not_done_again_and_failed_ones_are(config, folder, at_once):
     results, done = at_once
     points = mini.points(config, "seed=-1:3:5")
-    results[points[2].key] = Outcome(None, "once")
+    results[points[2].key] = Metrics(None, "once")
     results[points[3].key] = Died()
     results[points[4].key] = ModuleNotFoundError("No module named 'thincam_jax'")
     told = []

@@ -18,7 +18,7 @@ from hardware.memory_rig import World, fiducial, fiducial_plan, number_of, pictu
 from thincam_jax._core.capture_store import CaptureStoreError
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.plan import BLACK
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.errors import Busy, HardwareError, NotHomed, ProtocolError
 from thincam_jax.hardware.virtual.faults import FAULTS, Fault
 
@@ -82,7 +82,7 @@ def campaign(fault: Fault, times: int, folder: Path, kind: str = "fiducials") ->
         if not complete:
             incomplete = "frames are missing" if path.exists() else "store"
             with pytest.raises(CaptureStoreError, match=incomplete):
-                read_acquisition(path)
+                Acquisition.load(path)
     require_right(path, plan, world.exposed)
     happened = world.faults.happened
     return Row(fault, happened[fault], sum(happened.values()) - stopped, stopped)
@@ -93,7 +93,7 @@ def require_right(path: Path, plan, exposed=None) -> None:
 
     - `exposed`: what a world has exposed; each frame has to be another one of them.
     """
-    taken, world, stamps = read_acquisition(path), World(), []
+    taken, world, stamps = Acquisition.load(path), World(), []
     for number, step in enumerate(plan.steps):
         world.shown = world.render(plan.pattern(step))
         exposure, frame = taken.settings[step.settings].exposure, taken.frame(number)

@@ -29,7 +29,7 @@ from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition import journal, recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.base import Frame, Region
 from thincam_jax.hardware.displays import settle
@@ -44,8 +44,7 @@ from thincam_jax.hardware.errors import (
     Timeout,
 )
 from thincam_jax.hardware.plans import hadamard, pictures
-from thincam_jax.measured.calibration import HadamardSeries, open_captures, recover_matrix
-from thincam_jax.measured.calibration.captures import resume_captures
+from thincam_jax.measured.calibration import HadamardCaptures, HadamardSeries, recover_matrix
 
 QUICK = Procedure(timeout=0.001, reopen_wait=0.0)
 PLAN = fiducial_plan(20, dark_every=8)
@@ -62,7 +61,7 @@ def stop_after(count):
 
 
 def require_whole(path, plan=PLAN):
-    taken = read_acquisition(path)
+    taken = Acquisition.load(path)
     shown = [fiducial(taken.frame(number)) for number in range(len(plan.steps))]
     assert shown == [-1 if step.dark else step.pattern for step in plan.steps]
     return taken
@@ -102,11 +101,11 @@ def test_a_hadamard_plan_is_read_as_a_calibration(path, dark):
     world.see = lambda exposure: (matrix @ world.shown.ravel() + 7).reshape(SHAPE).astype("u2")
     world.render = render
     assert run(world, path, plan, progress=stop_after(11)).done == 11
-    for reader in (open_captures, resume_captures):
+    for reader in (HadamardCaptures.load, HadamardCaptures.resume):
         with pytest.raises(CaptureStoreError, match="the same acquisition again"):
             reader(path)
     assert run(world, path, plan).complete
-    captures = open_captures(path)
+    captures = HadamardCaptures.load(path)
     assert captures.series == series and captures.bits == 12
     assert captures.exposure == SETTINGS.exposure
     if dark:
@@ -129,7 +128,7 @@ def test_a_stopped_run_is_resumed(path, ctrl_c):
     assert run(world, path, progress=stop_after(6)).done == 6
     assert signal.getsignal(signal.SIGINT) is ctrl_c
     with pytest.raises(CaptureStoreError, match="17 of 23 frames are missing: 6, 7, 8"):
-        read_acquisition(path)
+        Acquisition.load(path)
     assert run(world, path).complete
     require_whole(path)
     assert run(world, path).complete  # there is nothing left to do
@@ -164,7 +163,7 @@ def test_only_the_same_run_is_resumed(path, monkeypatch):
             run(World(), path)
     (path / "plan.json").write_text("{}", "utf-8")
     with pytest.raises(CaptureStoreError, match="not what an acquisition made"):
-        read_acquisition(path)
+        Acquisition.load(path)
 
 
 def test_two_runs_cannot_write_one_store(path):
@@ -193,14 +192,14 @@ def test_a_torn_line_and_a_lost_chunk_are_taken_again(path):
     for torn in (whole[:-1], whole[:-9], whole[:-9] + b"\0" * 9, whole[:-9] + b"\0" * 8 + b"\n"):
         journal.write_bytes(torn)
         with pytest.raises(CaptureStoreError, match="of 23 frames are missing: .*; run"):
-            read_acquisition(path)
+            Acquisition.load(path)
         assert run(World(), path).done == 23
         require_whole(path)
     chunk = path / "frames" / "c" / "7" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-9])
     (path / "frames" / "c" / "9" / "0" / "0").unlink()
     with pytest.raises(CaptureStoreError, match="2 of 23 frames are missing: 7, 9"):
-        read_acquisition(path)
+        Acquisition.load(path)
     assert run(World(), path).complete
     taken = require_whole(path)
     chunk.write_bytes((path / "frames" / "c" / "8" / "0" / "0").read_bytes())
@@ -322,7 +321,7 @@ def test_what_is_no_frame_is_one_line_and_nothing_is_lost(path, monkeypatch, kin
     monkeypatch.undo()
     assert len(CaptureStore(path).digests) == len(PLAN.steps)
     with pytest.raises(CaptureStoreError, match="18 of 23 frames are missing"):
-        read_acquisition(path)
+        Acquisition.load(path)
     assert run(world, path).complete
     require_whole(path)
 
@@ -345,7 +344,7 @@ def test_the_exposure_is_found_once(path):
     run(world, path, procedure=procedure, progress=stop_after(4))
     world.light = 60.0  # the exposure that was found is kept
     found = run(world, path, procedure=procedure).found
-    taken = read_acquisition(path)
+    taken = Acquisition.load(path)
     assert found == (f"exposure {1000 * taken.settings[0].exposure:.4g} ms",)
     assert 1e-5 < taken.settings[0].exposure < 0.001
     assert np.quantile(taken.frame(1), 0.999) / 4095 == pytest.approx(0.3, rel=0.1)
@@ -361,7 +360,7 @@ def test_the_exposure_is_found_once(path):
         dataclasses.replace(PLAN, settings=(SETTINGS, longer)),
         procedure,
     )
-    first, second = read_acquisition(path.with_name("c")).settings
+    first, second = Acquisition.load(path.with_name("c")).settings
     assert first.exposure < 0.003
     assert second.exposure == pytest.approx(3 * first.exposure, rel=1e-3)
 
@@ -384,10 +383,10 @@ def test_the_settle_time_is_measured_once(path, monkeypatch):
 
     assert not begin(stop_after(1)).complete
     found = begin().found
-    known = read_acquisition(path).provenance["procedure"]["settle"]
+    known = Acquisition.load(path).provenance["procedure"]["settle"]
     assert 0.02 * np.log(100) <= known < 0.02 * np.log(100) + 0.5 / 8
     assert found == (f"settle time {1000 * known:.3g} ms",)
-    assert abs(read_acquisition(path).frame(2).mean() - (100 + 14 * 90)) < 0.015 * 14 * 110
+    assert abs(Acquisition.load(path).frame(2).mean() - (100 + 14 * 90)) < 0.015 * 14 * 110
 
 
 def test_a_full_disk_stops_the_run(path, monkeypatch):
@@ -455,7 +454,7 @@ def test_frames_of_a_store_have_one_shape(path):
     with pytest.raises(ValueError, match="regions of several sizes; give one size"):
         run(World(), path, plan)
     run(World(), path, dataclasses.replace(PLAN, settings=(regions[1],)))
-    assert read_acquisition(path).sensor_shape == (4, 5)
+    assert Acquisition.load(path).sensor_shape == (4, 5)
     with pytest.raises(ValueError, match="retries = -1: give a whole number from 0"):
         Procedure(retries=-1)
 

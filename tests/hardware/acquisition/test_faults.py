@@ -15,7 +15,7 @@ from hardware.memory_rig import World, by_rows, fiducial_plan, picture_plan, sce
 
 from helpers import ROOT, quick
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.errors import IncompleteFrame, ProtocolError
 from thincam_jax.hardware.virtual.faults import FAULTS
 
@@ -136,7 +136,7 @@ def test_a_stage_that_stays_is_moved_back_by_a_new_process(done, tmp_path):
         stop = lambda now: now.done == done and os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
         assert not acquire(plan, rig, tmp_path / "store", progress=stop).complete
     subprocess.run([*PROCESS, tmp_path / "store", "12", "stays"], env=ENVIRONMENT, check=True)
-    shots = read_acquisition(tmp_path / "store").shots
+    shots = Acquisition.load(tmp_path / "store").shots
     assert [shot["position"] for shot in shots] == [3.0] * 6 + [1.0] * 5 + [2.0] * 2
 
 

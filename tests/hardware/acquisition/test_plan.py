@@ -6,7 +6,7 @@ import math
 import pytest
 from hardware.memory_rig import SETTINGS
 
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
+from thincam_jax.hardware.acquisition.plan import BLACK, AcquisitionPlan, AcquisitionStep, Pattern
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.plans import (
     fringe_scan,
@@ -54,7 +54,7 @@ def test_the_ready_made_plans():
 
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
 def test_a_plan_comes_back_with_its_hash(plan):
-    again = Plan.from_json(plan.as_json())
+    again = AcquisitionPlan.from_json(plan.as_json())
     assert again == plan and again.hash == plan.hash
     assert len({other.hash for other in PLANS.values()}) == len(PLANS)
 
@@ -69,11 +69,11 @@ def test_every_part_of_a_plan_changes_its_hash():
         dataclasses.replace(plan, settings=(longer,)),
         dataclasses.replace(plan, settings=(smaller,)),
         dataclasses.replace(plan, steps=plan.steps[:-1]),
-        dataclasses.replace(plan, steps=(*plan.steps[:-1], Step(0, dark=True))),
+        dataclasses.replace(plan, steps=(*plan.steps[:-1], AcquisitionStep(0, dark=True))),
         dataclasses.replace(plan, patterns=(*plan.patterns, Pattern("other"))),
     ]
     assert len({plan.hash, *(other.hash for other in others)}) == 8
-    assert Plan.from_json(others[3].as_json()) == others[3]
+    assert AcquisitionPlan.from_json(others[3].as_json()) == others[3]
     # The order in which numbers are written does not count.
     turned = Pattern("fza", dict(reversed(list(MASK.numbers.items()))))
     assert method_b(turned, (25.0, 21.0), SETTINGS, dark_frames=2).hash == plan.hash
@@ -81,9 +81,9 @@ def test_every_part_of_a_plan_changes_its_hash():
 
 def test_a_plan_that_cannot_be_done_is_refused():
     with pytest.raises(ValueError, match="'a' has no steps; give at least one"):
-        Plan("a", (BLACK,), (SETTINGS,), ())
+        AcquisitionPlan("a", (BLACK,), (SETTINGS,), ())
     with pytest.raises(ValueError, match="step 1 .* points to number 1 of its 1 patterns; give 0"):
-        Plan("a", (BLACK,), (SETTINGS,), (Step(0), Step(1)))
+        AcquisitionPlan("a", (BLACK,), (SETTINGS,), (AcquisitionStep(0), AcquisitionStep(1)))
     with pytest.raises(ValueError, match="cannot be kept: .*; give finite numbers and texts"):
         method_b(MASK, (math.nan,), SETTINGS)
     with pytest.raises(ValueError, match="kind 'black' has no phase; give a zone_plate"):

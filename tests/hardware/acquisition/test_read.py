@@ -16,14 +16,14 @@ from hardware.memory_rig import World, by_rows, fiducial_plan
 from thincam_jax._core.capture_store import CaptureStoreError
 from thincam_jax.hardware import CameraSettings, open_rig
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.plan import WHITE, Plan, canonical_json
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.plan import WHITE, AcquisitionPlan, canonical_json
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.plans import scene
 from thincam_jax.hardware.virtual import VirtualRig
 from thincam_jax.hardware.virtual.rig import Electronics
 from thincam_jax.measured import Preparation, measure_sensor, prepare
-from thincam_jax.measured.calibration import open_captures
+from thincam_jax.measured.calibration import HadamardCaptures
 
 PLAN = by_rows(fiducial_plan(4, dark_every=2))
 DEEP = "[" * 200_000 + "]" * 200_000
@@ -167,8 +167,8 @@ def resumed(path):
 
 
 READERS = {
-    "read": lambda path: read_acquisition(path).captures(),
-    "open": lambda path: open_captures(path).rows(0, 6),
+    "read": lambda path: Acquisition.load(path).captures(),
+    "open": lambda path: HadamardCaptures.load(path).rows(0, 6),
     "resume": resumed,
 }
 
@@ -242,13 +242,13 @@ def test_colours_are_those_of_the_scene_wherever_the_region_begins(
     virtual = VirtualRig(Coloured(), display_shape=(8, 8))
     drivers = {"camera": (driver, {}), "display": ("sdl", {})}
     plan = scene(WHITE, settings, frames=2, dark_frames=2)
-    with open_rig(drivers, 1.0, virtual) as rig:
+    with open_rig(drivers, 1.0, virtual=virtual) as rig:
         assert acquire(plan, rig, tmp_path / "store").complete
-    found = read_acquisition(tmp_path / "store")
+    found = Acquisition.load(tmp_path / "store")
     assert found.settings[0].bayer == pattern
     raw, dark = found.raw(0), found.raw(2)
     options = Preparation(bayer=found.settings[0].bayer, capture_scale="none", corner=(1, 9))
-    ready = prepare(raw, raw, dark, options)
+    ready = prepare(raw, raw, background=dark, options=options)
     counts = raw.full_scale * ready.capture.mean(axis=(1, 2))
     electron = Electronics().scale(settings)[0]
     np.testing.assert_allclose(counts, 0.1 * electron * np.array(Coloured.colours), rtol=0.02)
@@ -260,10 +260,10 @@ def test_a_sensor_is_measured_from_a_store(tmp_path):
     drivers = {"camera": ("usb3_vision", {}), "display": ("sdl", {})}
     given = {"exposures": (0.02, 0.05, 0.1), "frames": 6, "dark_frames": 6}
     plan = scene(WHITE, CameraSettings(0.1, pixel_format="BayerRG12"), **given)
-    with open_rig(drivers, 1.0, virtual) as rig:
+    with open_rig(drivers, 1.0, virtual=virtual) as rig:
         acquire(plan, rig, tmp_path / "store")
-    found = read_acquisition(tmp_path / "store")
-    sensor = measure_sensor(found.exposed(), 2**found.bits - 1, mosaic=True)
+    found = Acquisition.load(tmp_path / "store")
+    sensor = measure_sensor(found.exposed(), full_scale=2**found.bits - 1, mosaic=True)
     truth = Electronics()
     electron = truth.scale(found.settings[0])[0]
     assert abs(sensor.conversion_gain - electron) < 4 * sensor.conversion_gain_error
@@ -278,7 +278,7 @@ def test_hashes_of_plans_stay_as_they_were(tmp_path):
     plan = scene(WHITE, CameraSettings(0.1, Region(1, 2, 3, 4)))
     for later in ("black_level", "binning", "trigger"):
         assert f'"{later}"' not in plan.as_json()
-    assert Plan.from_json(plan.as_json()) == plan
+    assert AcquisitionPlan.from_json(plan.as_json()) == plan
     assert plan.hash.startswith("d92cc4a7cc32bbd7")
     other = scene(WHITE, CameraSettings(0.1, black_level=64.0, binning=2, trigger="Line0"))
-    assert Plan.from_json(other.as_json()).settings == other.settings
+    assert AcquisitionPlan.from_json(other.as_json()).settings == other.settings

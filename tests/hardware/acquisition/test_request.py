@@ -56,8 +56,3 @@ def test_what_does_not_fit(given, field, message):
     with pytest.raises(FieldError, match=message) as caught:
         PlanRequest(**given)
     assert caught.value.field == field
-
-
-def test_wrong_numbers():
-    with pytest.raises(ValueError, match="betas = -25"):
-        PlanRequest("fringe_scan", betas=(-25.0,), width=1.4)

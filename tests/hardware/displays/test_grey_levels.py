@@ -8,7 +8,7 @@ from hardware.displays.rig import Panel, PanelCamera
 
 from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.displays.grey_levels import GreyLevels, linear_levels, measured_levels
 from thincam_jax.hardware.displays.patterns import pattern_levels
@@ -34,7 +34,7 @@ def test_a_calibrated_display_is_linear(panel, tmp_path):
     render = lambda pattern: pattern_levels(pattern, SHAPE, 0.0)  # noqa: E731
     with Rig(lambda: camera, lambda: display, render) as rig:
         acquire(plan, rig, tmp_path / "a.zarr")
-    levels = measured_levels(read_acquisition(tmp_path / "a.zarr"))
+    levels = measured_levels(Acquisition.load(tmp_path / "a.zarr"))
     assert levels.provenance["camera"]["model"] == "camera" and levels.provenance["frames"] == 2
     display.grey_levels = levels
     seen = []
@@ -62,15 +62,15 @@ def test_a_table_is_monotone_whatever_the_noise():
 def test_a_file_holds_the_table_and_its_origin(tmp_path):
     path = tmp_path / "levels.json"
     written = linear_levels(ALL, gamma(ALL), {"display": "LC 2012"})
-    written.write(path)
-    read = GreyLevels.read(path)
+    written.save(path)
+    read = GreyLevels.load(path)
     assert np.array_equal(read.table, written.table) and read.provenance == written.provenance
     for content in ({}, [], {"table": [0] * 255, "provenance": {}},
                     {"table": [300] * 256, "provenance": {}},
                     {"table": [0, 2, 1, *[3] * 253], "provenance": {}}):  # fmt: skip
         path.write_text(json.dumps(content))
         with pytest.raises(ValueError, match=r"levels\.json holds no table"):
-            GreyLevels.read(path)
+            GreyLevels.load(path)
 
 
 @pytest.mark.parametrize(

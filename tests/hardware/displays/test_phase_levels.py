@@ -64,13 +64,13 @@ def test_a_lens_and_its_mask():
 def test_a_file_holds_the_table(tmp_path):
     path = tmp_path / "slm.json"
     table = PhaseLevels(CURVE, LIGHT, 0.5, gap=0.2)
-    table.write(path)
-    assert PhaseLevels.read(path) == table
+    table.save(path)
+    assert PhaseLevels.load(path) == table
     for content in ({}, [], {"phases": [0.0], "wavelength": LIGHT},
                     {"phases": ["a", "b"], "wavelength": LIGHT},
                     {"phases": [0.0, 1.0], "wavelength": LIGHT, "gap": 2.0}):  # fmt: skip
         path.write_text(json.dumps(content))
         with pytest.raises(ValueError, match=r"slm\.json holds no table of phases"):
-            PhaseLevels.read(path)
+            PhaseLevels.load(path)
     with pytest.raises(ValueError, match=r"none\.json holds no table of phases: .*No such file"):
-        PhaseLevels.read("none.json")
+        PhaseLevels.load("none.json")

@@ -50,7 +50,7 @@ def test_every_pixel_is_presented_when_show_returns(folder):
 
 def test_grey_levels_of_a_file_are_applied(folder):
     table = np.arange(255, -1, -1).astype(np.uint8)
-    GreyLevels(table, {}).write(folder / "levels.json")
+    GreyLevels(table, {}).save(folder / "levels.json")
     options = {"size": SIZE, "grey_levels": str(folder / "levels.json")}
     with open_device("displays", "sdl", options) as display:
         pattern = RANDOM.integers(0, 256, SIZE, dtype=np.uint8)

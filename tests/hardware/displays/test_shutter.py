@@ -10,7 +10,7 @@ from hardware.memory_rig import SETTINGS, MemoryCamera, World
 
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.plan import WHITE
-from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.displays.patterns import pattern_levels
 from thincam_jax.hardware.displays.shutter import Shutter
@@ -43,7 +43,7 @@ def test_it_is_asked_for_once(rig, tmp_path):
     procedure = Procedure(settle=None, exposure="auto")
     acquire(plan, rig[0], tmp_path / "a.zarr", procedure=procedure)
     assert rig[1] == ["cover the camera"]
-    taken = read_acquisition(tmp_path / "a.zarr")
+    taken = Acquisition.load(tmp_path / "a.zarr")
     assert taken.frame(3).max() == 4095  # the longer one may be full
     frame, variance = taken.scene()
     assert frame.shape == (1, *taken.sensor_shape) and np.isfinite(variance).all()
@@ -61,7 +61,7 @@ def test_a_resumed_run_does_not_take_the_camera_for_open(rig, tmp_path):
     rig[0].reopen("display")  # as in another process
     assert acquire(plan, rig[0], store).complete
     assert rig[1] == ["cover the camera", "uncover the camera", "cover the camera"]
-    taken = read_acquisition(store)
+    taken = Acquisition.load(store)
     np.testing.assert_array_equal(taken.frame(2), taken.frame(0))
 
 

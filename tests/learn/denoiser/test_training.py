@@ -132,9 +132,3 @@ def test_an_interrupted_training_ends_with_the_same_numbers(interrupted, whole, 
     state.write_bytes(state.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match="is damaged or cut off"):
         train_denoiser(untrained(), LESSONS, OPTIONS, folder=tmp_path)
-
-
-@pytest.mark.parametrize("wrong", [{"crop": 0}, {"crop": TILE + 1}, {"batch": 0}])
-def test_lessons_out_of_range_are_told(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        dataclasses.replace(LESSONS, **wrong)

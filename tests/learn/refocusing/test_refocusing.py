@@ -16,7 +16,7 @@ from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork, explain
 from thincam_jax.learn.refocusing.planes import Planes
-from thincam_jax.learn.refocusing.scenes import Scene, SceneOptions, captured, draw_batch
+from thincam_jax.learn.refocusing.scenes import LayeredScene, SceneOptions, captured, draw_batch
 from thincam_jax.learn.refocusing.sources import photographs
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.units import nm, um
@@ -88,7 +88,7 @@ def two_layers(camera, near, far):
     radiance = jnp.zeros((3, *SHAPE)).at[1].set(1.0).at[2].set(0.5)
     share = jnp.zeros((3, 3, *SHAPE)).at[:, 1].set(1.0)
     inverse = jnp.broadcast_to(1 / jnp.asarray([near, near, far])[:, None], (3, 3))
-    return Scene(radiance, cover, share, inverse)
+    return LayeredScene(radiance, cover, share, inverse)
 
 
 @pytest.mark.thorough

@@ -101,36 +101,16 @@ def test_display_pixels():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"beta": -25.0}, r"beta = -25.0 rad/mm\^2 is not positive; give beta > 0"),
-        ({"beta": np.nan}, "beta is NaN"),
-        ({"beta": np.inf}, "beta is infinite"),
-        ({"width": 0.0}, "width = 0.0 mm is not positive"),
-        ({"phase": np.inf}, "phase = inf rad is not finite"),
-        ({"centre": (0.0,)}, r"centre has shape \(1,\); give an array of shape \(2,\) in mm"),
-        ({"centre": (0.0, np.nan)}, "centre is NaN"),
-        ({"fill_factor": 1.2}, "fill_factor = 1.2 is out of range; give 0 < fill_factor <= 1"),
-        ({"fill_factor": 0.0}, "fill_factor = 0.0 is out of range"),
-        ({"harmonics": 4}, "harmonics = 4: give an odd number from 1 to 99"),
-        ({"harmonics": 101}, "harmonics = 101"),
         (
             {"pixel_pitch": 0.03},
             r"width = 1 mm is not a whole number of cells of pixel_pitch = 0.03",
         ),
         ({"pixel_pitch": 0.03}, "give width = 0.99 or 1.02 mm"),
-        ({"pixel_pitch": -0.1}, "pixel_pitch = -0.1 mm is not positive"),
-        ({"beta": np.ones(3)}, r"beta has shape \(3,\); give one number in rad/mm\^2"),
     ],
 )
 def test_refusals(arguments, message):
     with pytest.raises(ValueError, match=message):
         tc.FresnelZoneAperture(**({"beta": 25.0, "width": 1.0} | arguments))
-
-
-def test_refuses_units_as_text():
-    with pytest.raises(TypeError, match=r"width = '5.6 mm' is not a real number; give it in mm"):
-        tc.FresnelZoneAperture(25.0, width="5.6 mm")
-    with pytest.raises(TypeError, match="phase = 1j is not a real number"):
-        tc.FresnelZoneAperture(25.0, 1j, width=1.0)
 
 
 def test_integers_become_numbers_and_arrays_keep_their_precision():

@@ -42,14 +42,6 @@ def test_extent_is_height_and_width():
     np.testing.assert_allclose([height, width], [0.2, 0.3])
 
 
-@pytest.mark.parametrize("shape", [(3,), (0, 4), (2, 3, 1)])
-def test_refuses_what_is_no_image(shape):
-    with pytest.raises(
-        ValueError, match=r"amplitude has shape .*; give a non-empty array \(y, x\)"
-    ):
-        tc.SampledMask(np.ones(shape), 0.1)
-
-
 def test_whole_numbers_become_real():
     assert tc.SampledMask(np.eye(3, dtype=int), 0.1).amplitude.dtype == jnp.float64
     with pytest.raises(ValueError, match="pitch = 0.0 mm is not positive"):

@@ -189,12 +189,6 @@ def test_a_plan_is_not_run_on_another_scene():
         tc.capture(camera(), scene(2, 2), model=plan, pixel_integration=True)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, -1.0, 5.0, float("nan"), float("inf")])
-def test_bad_tolerances(tolerance):
-    with pytest.raises(ValueError, match="tolerance"):
-        tc.plan_capture(camera(), scene(1, 1), tolerance=tolerance)
-
-
 def test_what_cannot_be_planned():
     own = camera()
 
@@ -296,7 +290,7 @@ def test_a_plan_notices_other_light_and_larger_planes():
     wider = [tc.ImagePlane(p.image, p.distance, 2 * p.width) for p in few.planes]
     with pytest.raises(ValueError, match=r"cover \(\d+, \d+\) samples.*make a plan"):
         tc.capture(camera(), tc.Scene(wider, few.spectrum), model=plan)
-    with pytest.raises(TypeError, match=r"scene is ImagePlane\(.*; give Scene\(planes, spectrum\)"):
+    with pytest.raises(TypeError, match=r"scene is ImagePlane\(.*; give Scene\(planes, …\)"):
         tc.plan_capture(camera(), few.planes[0], tolerance=0.1)
 
 

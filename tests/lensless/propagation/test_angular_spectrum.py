@@ -8,7 +8,7 @@ from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.lensless import Path
+from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.propagation.angular_spectrum import (
     angular_spectrum,
     angular_spectrum_sampling,
@@ -21,15 +21,21 @@ WAVELENGTH = 500e-6
 # A gentle set-up: at d = 20 mm the waves of the edges stay under 2°, where Fresnel holds.
 MASK = tc.FresnelZoneAperture(200.0, 0.3, width=0.5, centre=(0.02, -0.03))
 GRID = tc.Grid((60, 76), 0.01)
-GENTLE = Path(WAVELENGTH, 20.0)
+GENTLE = LightPath(WAVELENGTH, 20.0)
 
 sampled = jax.jit(
     lambda mask, grid, path, padding=2.0, **settings: angular_spectrum(
-        mask, grid, path, tc.PsfMethod("angular_spectrum", **settings), padding=padding
+        mask,
+        grid,
+        path,
+        tc.PsfMethod("angular_spectrum", **{"pixel_integration": False} | settings),
+        padding=padding,
     ),
     static_argnames=("mask_shape", "oversampling", "padding", "pixel_integration"),
 )
-exact = jax.jit(lambda mask, grid, path: separable(mask, grid, path).image())
+exact = jax.jit(
+    lambda mask, grid, path: separable(mask, grid, path, pixel_integration=False).image()
+)
 sample = jax.jit(lambda mask, grid: mask.sample(grid))
 carry = jax.jit(propagate)
 
@@ -60,7 +66,7 @@ def test_converges_to_separable(capsys):
 @pytest.mark.thorough
 def test_finite_object_distance():
     """The exact spherical wave and the scale M² lead to the same PSF as Eq 3.2's scaling."""
-    path = Path(WAVELENGTH, 20.0, 60.0)
+    path = LightPath(WAVELENGTH, 20.0, 60.0)
     value = sampled(MASK, GRID, path, mask_shape=(54, 56), oversampling=3, padding=2.0)
     assert relative_l2(value, exact(MASK, GRID, path)) < 5e-3
 
@@ -83,8 +89,8 @@ def test_steep_edge_waves_are_beyond_fresnel():
     """At d = 2 mm the edges' waves reach 8° and more: the Fresnel model `separable` is 2.5 % from
     the direct sum over the same samples, of which `angular_spectrum` is a few parts in 10,000."""
     mask = tc.FresnelZoneAperture(200.0, 0.3, width=0.3)
-    grid, path = tc.Grid((12, 15), 0.03), Path(WAVELENGTH, 2.0)
-    method = tc.PsfMethod("rayleigh_sommerfeld", oversampling=31, mask_shape=(10, 11))
+    grid, path = tc.Grid((12, 15), 0.03), LightPath(WAVELENGTH, 2.0)
+    method = tc.PsfMethod("rayleigh_sommerfeld", None, False, 31, (10, 11))
     direct = jax.jit(lambda *a: rayleigh_sommerfeld(*a, method))(mask, grid, path)
     fourier = sampled(mask, grid, path, mask_shape=(10, 11), oversampling=31)
     fresnel = exact(mask, grid, path)
@@ -112,7 +118,7 @@ def test_nothing_wraps_round(padding, tolerance):
     On a window that is not padded the hole's light comes back in on the other side.
     """
     hole = tc.SampledMask(np.ones((6, 5)), 0.01, centre=(0.26, 0.34))
-    path = Path(WAVELENGTH, 40.0)
+    path = LightPath(WAVELENGTH, 40.0)
     rows, columns = (reference.centred(n, 0.01) for n in GRID.shape)
     b = float(path.fresnel_curvature)
     field = np.outer(
@@ -142,7 +148,7 @@ def test_a_plane_wave_turns_by_its_angle():
     x = np.arange(250) * pitch
     frequency = 40 / (250 * pitch)  # 80 cycles/mm, 2.3°
     wave = jnp.asarray(np.exp(2j * np.pi * frequency * x) * np.ones((8, 1)))
-    out = carry(wave, jnp.asarray(pitch), Path(WAVELENGTH, d))
+    out = carry(wave, jnp.asarray(pitch), LightPath(WAVELENGTH, d))
     cosine = np.cos(np.arcsin(WAVELENGTH * frequency))
     expected = wave * np.exp(2j * np.pi * d / WAVELENGTH * (cosine - 1))
     np.testing.assert_allclose(out, expected, rtol=0, atol=1e-10)
@@ -161,7 +167,7 @@ def random_field(seed, shape=(48, 63)):
 def test_energy_and_adjoint():
     """|U|² is kept; the adjoint, ⟨Pu, w⟩ = ⟨u, P*w⟩, runs the light backwards: P*w = (P w*)*."""
     u, w = random_field(1), random_field(2)
-    pitch, path = jnp.asarray(0.01), Path(WAVELENGTH, 9.0)
+    pitch, path = jnp.asarray(0.01), LightPath(WAVELENGTH, 9.0)
     forward = carry(u, pitch, path)
     np.testing.assert_allclose(jnp.vdot(forward, forward), jnp.vdot(u, u), rtol=1e-12)
     backward = carry(w.conj(), pitch, path).conj()
@@ -182,7 +188,7 @@ def test_sampling_predicate_tells_good_from_bad():
         "far": (0.01, (60, 77), 4000.0),
     }
     for name, (pitch, shape, distance) in cases.items():
-        path, grid = Path(WAVELENGTH, distance), tc.Grid(shape, pitch)
+        path, grid = LightPath(WAVELENGTH, distance), tc.Grid(shape, pitch)
         value = sampled(mask, grid, path, mask_shape=shape)
         error = relative_l2(value, exact(mask, grid, path))
         count = 4 * shape[0]  # padding 2: twice mask and sensor

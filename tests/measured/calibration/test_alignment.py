@@ -124,10 +124,10 @@ def test_a_picture_is_placed_where_the_model_has_it():
 def test_a_file_is_read_back_and_another_one_refused(tmp_path):
     path = tmp_path / "alignment.json"
     found = fit_alignment(DISPLAY, SHOWN, seen(HOMOGRAPHY, 0.05), "homography", 0.5)
-    found.write(path)
-    again = Alignment.read(path)
+    found.save(path)
+    again = Alignment.load(path)
     assert str(again) == str(found) and again.shape == (60, 80)
     assert np.array_equal(again(SHOWN), found(SHOWN))
     path.write_text(json.dumps(json.loads(path.read_text("utf-8")) | {"unknowns": [1]}), "utf-8")
     with pytest.raises(ValueError, match="holds no alignment of a display"):
-        Alignment.read(path)
+        Alignment.load(path)

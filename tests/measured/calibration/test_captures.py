@@ -7,13 +7,8 @@ import pytest
 import zarr
 from ome_zarr_models.v05.image import Image
 
-from thincam_jax.measured.calibration import (
-    HadamardSeries,
-    create_captures,
-    open_captures,
-    recover_matrix,
-)
-from thincam_jax.measured.calibration.captures import CaptureStoreError, resume_captures
+from thincam_jax.measured.calibration import HadamardCaptures, HadamardSeries, recover_matrix
+from thincam_jax.measured.calibration.captures import CaptureStoreError
 
 SERIES = HadamardSeries((4, 8), "natural", "binary", dark_frames=3)
 SHAPE = (5, 7)
@@ -21,7 +16,7 @@ FRAMES = np.random.default_rng(0).integers(0, 1024, (SERIES.frame_count, *SHAPE)
 
 
 def filled(path, numbers=range(SERIES.frame_count)):
-    with create_captures(path, SERIES, SHAPE, bits=10, exposure=0.02) as writer:
+    with HadamardCaptures.create(path, SERIES, SHAPE, bits=10, exposure=0.02) as writer:
         for number in numbers:
             writer.write(number, FRAMES[number])
     return path
@@ -29,7 +24,7 @@ def filled(path, numbers=range(SERIES.frame_count)):
 
 def test_frames_come_back_in_any_order(tmp_path):
     shuffled = np.random.default_rng(1).permutation(SERIES.frame_count)
-    captures = open_captures(filled(tmp_path / "a.zarr", shuffled))
+    captures = HadamardCaptures.load(filled(tmp_path / "a.zarr", shuffled))
     assert captures.series == SERIES
     assert (captures.sensor_shape, captures.bits, captures.exposure) == (SHAPE, 10, 0.02)
     np.testing.assert_array_equal(captures.rows(2, 5), FRAMES[:, 2:5])
@@ -38,12 +33,12 @@ def test_frames_come_back_in_any_order(tmp_path):
 def test_missing_frames_are_named_and_can_be_written_later(tmp_path):
     path = filled(tmp_path / "a.zarr", [n for n in range(SERIES.frame_count) if n not in (5, 30)])
     with pytest.raises(CaptureStoreError, match="2 of 35 frames are missing: 5, 30; capture them"):
-        open_captures(path)
-    with resume_captures(path) as writer:
+        HadamardCaptures.load(path)
+    with HadamardCaptures.resume(path) as writer:
         assert writer.missing == [5, 30]
         for number in writer.missing:
             writer.write(number, FRAMES[number])
-    np.testing.assert_array_equal(open_captures(path).rows(0, 5), FRAMES)
+    np.testing.assert_array_equal(HadamardCaptures.load(path).rows(0, 5), FRAMES)
 
 
 def test_a_lost_and_a_truncated_chunk_are_named(tmp_path):
@@ -53,11 +48,11 @@ def test_a_lost_and_a_truncated_chunk_are_named(tmp_path):
     whole = chunk.read_bytes()
     chunk.write_bytes(whole[:-9])
     with pytest.raises(CaptureStoreError, match="3 of 35 frames are truncated: 32, 33, 34; "):
-        open_captures(path)
+        HadamardCaptures.load(path)
     chunk.unlink()
     with pytest.raises(CaptureStoreError, match="3 of 35 frames are missing: 32, 33, 34; "):
-        open_captures(path)
-    with resume_captures(path) as writer:
+        HadamardCaptures.load(path)
+    with HadamardCaptures.resume(path) as writer:
         for number in writer.missing:
             writer.write(number, FRAMES[number])
     assert chunk.read_bytes() == whole
@@ -65,7 +60,7 @@ def test_a_lost_and_a_truncated_chunk_are_named(tmp_path):
     damaged[3] ^= 1
     chunk.write_bytes(damaged)
     with pytest.raises(CaptureStoreError, match="frames 32 … 34 are damaged"):
-        recover_matrix(open_captures(path))
+        recover_matrix(HadamardCaptures.load(path))
 
 
 def test_other_programs_read_a_store_as_ome_zarr(tmp_path):
@@ -78,15 +73,15 @@ def test_other_programs_read_a_store_as_ome_zarr(tmp_path):
 
 
 def test_the_same_image_twice_is_named(tmp_path):
-    with create_captures(tmp_path / "a.zarr", SERIES, SHAPE) as writer:
+    with HadamardCaptures.create(tmp_path / "a.zarr", SERIES, SHAPE) as writer:
         for number, image in enumerate(FRAMES):
             writer.write(number, FRAMES[16] if number == 17 else image)
     with pytest.raises(CaptureStoreError, match="frames 16, 17 are the same capture"):
-        open_captures(tmp_path / "a.zarr")
+        HadamardCaptures.load(tmp_path / "a.zarr")
 
 
 def test_a_frame_of_another_kind_is_refused(tmp_path):
-    with create_captures(tmp_path / "a.zarr", SERIES, SHAPE, bits=10) as writer:
+    with HadamardCaptures.create(tmp_path / "a.zarr", SERIES, SHAPE, bits=10) as writer:
         writer.write(4, FRAMES[4])
         for number, image, message in (
             (4, FRAMES[4], "frame 4 was captured before"),
@@ -99,29 +94,29 @@ def test_a_frame_of_another_kind_is_refused(tmp_path):
             with pytest.raises(CaptureStoreError, match=message):
                 writer.write(number, image)
     with pytest.raises(CaptureStoreError, match="34 of 35 frames are missing: 0, 1, 2, 3, 5"):
-        open_captures(tmp_path / "a.zarr")
+        HadamardCaptures.load(tmp_path / "a.zarr")
 
 
 def test_what_is_no_store_is_refused(tmp_path):
     path = filled(tmp_path / "a.zarr")
     with pytest.raises(CaptureStoreError, match="exists; give another name"):
-        create_captures(path, SERIES, SHAPE)
+        HadamardCaptures.create(path, SERIES, SHAPE)
     with pytest.raises(CaptureStoreError, match="is no store of Hadamard captures"):
-        open_captures(tmp_path / "b.zarr")
+        HadamardCaptures.load(tmp_path / "b.zarr")
     about = path / "zarr.json"
     text = about.read_text("utf-8")
     about.write_text(text.replace('"dark_frames": 3', '"dark_frames": 4'))
     with pytest.raises(CaptureStoreError, match="contradicts itself: arrays of shapes"):
-        open_captures(path)
+        HadamardCaptures.load(path)
     about.write_text(text[:100])
     with pytest.raises(CaptureStoreError, match="is no store of Hadamard captures"):
-        open_captures(path)
+        HadamardCaptures.load(path)
     with pytest.raises(ValueError, match="bits = 24; give 1 to 16"):
-        create_captures(tmp_path / "c.zarr", SERIES, SHAPE, bits=24)
+        HadamardCaptures.create(tmp_path / "c.zarr", SERIES, SHAPE, bits=24)
 
 
 def test_stores_need_zarr(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)  # as where it is not installed
-    for use in (open_captures, lambda path: create_captures(path, SERIES, SHAPE)):
+    for use in (HadamardCaptures.load, lambda path: HadamardCaptures.create(path, SERIES, SHAPE)):
         with pytest.raises(CaptureStoreError, match=r"pip install 'thincam_jax\[stores\]'"):
             use(tmp_path / "a.zarr")

@@ -31,12 +31,12 @@ def camera(reference=61.2, glass=5.0, lens=10.0, tilt=0.0, pixels=(22, 30), pitc
     return wg.SeeThroughCamera(wg.Screen(film, glass, 1.5), tc.Sensor(pixels, pitch), 6.0, lens)
 
 
-def plane(distance=550.0, centre=(0.0, 27.0), shape=CELLS):
+def plane(distance=550.0, centre=(27.0, 0.0), shape=CELLS):
     return wg.ObjectPlane(shape, distance, 150.0, centre)
 
 
 TRUE = {"reference": 61.7, "glass": 5.1, "lens": 10.6, "tilt": 0.01}
-CENTRE = (0.8, 27.9)
+CENTRE = (27.9, 0.8)
 VALUES = {
     "glass_thickness": 5.1,
     "lens_distance": 10.6,
@@ -50,11 +50,11 @@ VALUES = {
 def ghosts(deviation, true=TRUE, orders=3, leaning=(0.0, 0.0)):
     """A dot for every order of twelve pixels, the middle of its band, with an error."""
     random = np.random.default_rng(0)
-    pixels = random.uniform(-1, 1, (12, 2))
+    pixels = random.uniform(-1, 1, (12, 2))[:, ::-1]
     sts = eqx.tree_at(lambda c: c.tilt, camera(**true), jnp.asarray(leaning))
     seen = trace_band(sts, jnp.asarray(pixels), 550.0, orders, 1).points[:, :, 0]
     points = (np.asarray(seen) - CENTRE).reshape(-1, 2)
-    noisy = points + deviation * random.normal(size=points.shape)
+    noisy = points + deviation * random.normal(size=points.shape)[:, ::-1]
     return GhostPositions(
         np.tile(pixels, (orders, 1)), noisy, np.repeat(np.arange(orders), 12), deviation
     )
@@ -87,7 +87,7 @@ def test_the_smear_is_in_the_model():
     """Without it the glass is off by many standard errors, and χ² says so."""
     measured, names = ghosts(0.01), ("glass_thickness", "object_y")
     start = camera(**TRUE | {"glass": 5.0}), plane(centre=CENTRE)
-    fit, without = (fit_screen(measured, *start, names, samples=s) for s in (4, None))
+    fit, without = (fit_screen(measured, *start, parameters=names, samples=s) for s in (4, None))
     truth = {name: VALUES[name] for name in names}
     assert fit.status == "ok" and np.abs(deviations(fit, truth)).max() < 4
     assert without.status == "poor_fit" and np.abs(deviations(without, truth)).max() > 10
@@ -104,7 +104,7 @@ def test_the_smear_is_in_the_model():
     ],
 )
 def test_undetermined_parameters_are_named(names, reason):
-    fit = fit_screen(ghosts(0.05), camera(), plane(), names, samples=None)
+    fit = fit_screen(ghosts(0.05), camera(), plane(), parameters=names, samples=None)
     assert any(reason in line for line in fit.reasons)
 
 
@@ -112,15 +112,15 @@ def test_undetermined_parameters_are_named(names, reason):
 def test_a_plate_that_leans():
     """Found from ghosts within the errors that are claimed; held upright it explains them badly."""
     measured, start = ghosts(0.05, leaning=(0.02, -0.01)), (camera(**TRUE), plane(centre=CENTRE))
-    fit = fit_screen(measured, *start, ("plate_x", "plate_y"))
+    fit = fit_screen(measured, *start, parameters=("plate_x", "plate_y"))
     assert fit.status == "ok"
     assert np.abs(deviations(fit, {"plate_x": 0.02, "plate_y": -0.01})).max() < 4
-    assert fit_screen(measured, *start, ("object_x", "object_y")).status == "poor_fit"
+    assert fit_screen(measured, *start, parameters=("object_x", "object_y")).status == "poor_fit"
 
 
 @pytest.mark.thorough
 def test_another_screen_is_a_poor_fit():
-    fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), ("slant",))
+    fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), parameters=("slant",))
     assert fit.status == "poor_fit"
 
 
@@ -141,7 +141,7 @@ def test_a_screen_from_its_matrix(optimised):
 @pytest.mark.thorough
 def test_edges_of_holograms_that_cut_bands():
     """Weights of cut bands are in the model; without, values are 50 standard errors off."""
-    bottom = wg.Rectangle((0.0, 22.5), (50.0, 45.0))  # the second ghost's light ends about it
+    bottom = wg.Rectangle((22.5, 0.0), (45.0, 50.0))  # the second ghost's light ends about it
 
     def cut(glass):
         given = camera(pixels=(7, 9), pitch=200.0 * um, glass=glass)
@@ -149,7 +149,7 @@ def test_edges_of_holograms_that_cut_bands():
 
     measured = matrix(wg.system_operator(cut(5.0), plane(), samples=4), noise=2e-4)
     names = ("glass_thickness", "object_y")
-    fit = fit_screen(measured, cut(5.05), plane(), names, samples=4)
+    fit = fit_screen(measured, cut(5.05), plane(), parameters=names, samples=4)
     assert np.abs(deviations(fit, {"glass_thickness": 5.0, "object_y": 27.0})).max() < 4
 
 
@@ -183,14 +183,14 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="the sensor has 30 × 22, but the matrix was measured for"):
         fit_screen(measured, camera(pixels=(30, 22)), plane())
     with pytest.raises(ValueError, match="a name in parameters = 'w'"):
-        fit_screen(measured, camera(), plane(), ("w",))
+        fit_screen(measured, camera(), plane(), parameters=("w",))
     with pytest.raises(ValueError, match="give a tuple of different names"):
-        fit_screen(measured, camera(), plane(), ("tilt", "tilt"))
+        fit_screen(measured, camera(), plane(), parameters=("tilt", "tilt"))
     few = GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), 0.1)
     with pytest.raises(ValueError, match="2 measured numbers for 6 unknowns: give more ghosts"):
         fit_screen(few, camera(), plane())
     late = GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.array([4]), 0.1)
     with pytest.raises(ValueError, match="a ghost of order 4, but orders = 4"):
-        fit_screen(late, camera(), plane(), ("slant",))
+        fit_screen(late, camera(), plane(), parameters=("slant",))
     with pytest.raises(ValueError, match="orders = .*; give a whole number"):
         GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.array([0.5]), 0.1)

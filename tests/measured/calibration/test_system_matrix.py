@@ -12,8 +12,8 @@ from helpers import full_disk
 from thincam_jax._core.files import WriteError
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration import (
+    HadamardCaptures,
     HadamardSeries,
-    create_captures,
     recover_matrix,
     simulate_captures,
 )
@@ -36,7 +36,7 @@ SERIES = [
 
 def simulated(folder, series, dtype=np.float64, bits=None, **noise):
     operator = Matrix(TRUTH.astype(dtype), CELLS, SHAPE)
-    writer = create_captures(folder / "captures.zarr", series, SHAPE, bits=bits)
+    writer = HadamardCaptures.create(folder / "captures.zarr", series, SHAPE, bits=bits)
     return simulate_captures(writer, operator, jax.random.key(5), **noise)
 
 
@@ -94,13 +94,15 @@ def test_a_stored_matrix_is_that_in_memory(tmp_path, monkeypatch):
     with full_disk(1_500), pytest.raises(WriteError, match=full):
         write_matrix(captures, tmp_path / "other.zarr")
     with full_disk(100), pytest.raises(WriteError, match=full):
-        create_captures(tmp_path / "an-other.zarr", SERIES[0], SHAPE)
+        HadamardCaptures.create(tmp_path / "an-other.zarr", SERIES[0], SHAPE)
 
 
 def test_an_image_comes_back_by_the_measured_matrix(tmp_path):
     """A matrix in counts of a camera of 12 bits gives images in the unit of the cells."""
     operator = Matrix(TRUTH.astype(np.float32) * 150, CELLS, SHAPE)
-    writer = create_captures(tmp_path / "captures.zarr", HadamardSeries(CELLS), SHAPE, bits=12)
+    writer = HadamardCaptures.create(
+        tmp_path / "captures.zarr", HadamardSeries(CELLS), SHAPE, bits=12
+    )
     captures = simulate_captures(writer, operator, jax.random.key(5), deviation=5.0, offset=40.0)
     image = jnp.linspace(0, 1, 32, dtype=jnp.float32).reshape(CELLS)
     recording = tc.Recording(operator(image), recover_matrix(captures), noise_variance=1e-4)
@@ -109,7 +111,7 @@ def test_an_image_comes_back_by_the_measured_matrix(tmp_path):
 
 
 def test_another_camera_than_the_sensor_is_refused(tmp_path):
-    writer = create_captures(tmp_path / "captures.zarr", HadamardSeries(CELLS), (10, 12))
+    writer = HadamardCaptures.create(tmp_path / "captures.zarr", HadamardSeries(CELLS), (10, 12))
     with pytest.raises(
         ValueError, match=r"goes from \(4, 8\) to \(12, 10\); give \(\(4, 8\), \(10"
     ):

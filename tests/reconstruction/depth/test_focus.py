@@ -121,8 +121,3 @@ def test_single_precision_is_kept():
 def test_faults_are_refused(settings, part):
     with unchecked(), pytest.raises(ValueError, match=part):
         focus_measure(picture(), **settings)
-
-
-def test_unknown_measure_is_refused():
-    with unchecked(), pytest.raises(ValueError, match="choose one of 'laplacian_variance'"):
-        focus_measure(picture(), "sharpness")

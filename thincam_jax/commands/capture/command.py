@@ -23,7 +23,7 @@ from thincam_jax.commands.terminal import (
 if TYPE_CHECKING:
     from thincam_jax.commands.capture.config import CaptureConfig
     from thincam_jax.commands.capture.run import Taken
-    from thincam_jax.hardware.acquisition.plan import Pattern, Plan
+    from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern
     from thincam_jax.hardware.acquisition.rig import Rig
     from thincam_jax.hardware.virtual.rig import VirtualRig
 
@@ -169,7 +169,7 @@ def known_drivers(connected: bool = False, asked: str | None = None) -> list[str
     return registry.driver_report() + there
 
 
-def build_plan(config: "CaptureConfig") -> "Plan":
+def build_plan(config: "CaptureConfig") -> "AcquisitionPlan":
     """The plan of a file, with its settings."""
     from thincam_jax.commands.capture.run import picture_levels
     from thincam_jax.hardware.base import CameraSettings
@@ -186,7 +186,7 @@ def build_plan(config: "CaptureConfig") -> "Plan":
 
 
 @contextlib.contextmanager
-def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
+def opened(config: "CaptureConfig", plan: "AcquisitionPlan") -> Iterator["Rig"]:
     """The rig of a file with its devices open, its stage homed.
 
     **Errors**: ConfigError for options of a driver, and for what the display cannot show.
@@ -200,8 +200,8 @@ def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
         try:
-            given = {"turns_phase": config.mask is not None}
-            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual, pictures, **given))
+            given = {"turns_phase": config.mask is not None, "pictures": pictures}
+            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual=virtual, **given))
         except (ValueError, TypeError) as error:
             raise ConfigError(f"options: {error}") from None
         _shown(rig.render, plan.patterns[0])
@@ -258,17 +258,17 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
 
     from thincam_jax._core.files import read_json
     from thincam_jax.commands.capture.run import Taken, picture_levels
-    from thincam_jax.hardware.acquisition.read import read_acquisition
+    from thincam_jax.hardware.acquisition.read import Acquisition
     from thincam_jax.hardware.displays.grey_levels import measured_levels
     from thincam_jax.hardware.displays.patterns import pattern_levels
     from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Electronics
-    from thincam_jax.measured.calibration import open_captures
+    from thincam_jax.measured.calibration import HadamardCaptures
     from thincam_jax.studies.rig import CountingCamera, RigFrames
 
-    found, kind = read_acquisition(store), config.plan.kind
+    found, kind = Acquisition.load(store), config.plan.kind
     camera, variance, calibration = None, None, None
     if kind in ("hadamard", "grey_levels"):
-        calibration = open_captures(store) if kind == "hadamard" else measured_levels(found)
+        calibration = HadamardCaptures.load(store) if kind == "hadamard" else measured_levels(found)
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
     elif kind == "scene" or config.alignment:
         frames, variance = found.scene()

@@ -57,7 +57,7 @@ class PhaseLevelsConfig(section(PhaseLevels)):
 def _read(given: Any) -> Any:
     if not isinstance(given, str):
         return given
-    return PhaseLevelsConfig.model_construct(**asdict(PhaseLevels.read(given)))
+    return PhaseLevelsConfig.model_construct(**asdict(PhaseLevels.load(given)))
 
 
 PhaseTable = Annotated[

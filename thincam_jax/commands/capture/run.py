@@ -191,12 +191,12 @@ class _CaptureRun(Run):
         study = build_study(config, (frames.shape[1], frames.shape[2]))
         display = self.taken.shown, config.display.pitch or 0.0
         found = align_display(study, frames, *display, config.plan.map)
-        found.write(self.folder.path / "alignment.json")
+        found.save(self.folder.path / "alignment.json")
         self.metrics["alignment"], self.found = found.summary(), str(found)
 
     def linearise(self) -> None:
         """The table of a display's grey levels, which its option of that name takes."""
-        self.taken.calibration.write(self.folder.path / "grey_levels.json")
+        self.taken.calibration.save(self.folder.path / "grey_levels.json")
         self.metrics["grey_levels"] = dict(self.taken.calibration.provenance)
 
     def recover(self) -> None:
@@ -285,7 +285,7 @@ def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
     def levels(one: PictureConfig) -> tuple[str, np.ndarray]:
         found = np.rint(255 * picture(one, config.cells)).astype(np.uint8)
         if config.alignment and config.optics:
-            found = Alignment.read(config.alignment).place(found, config.optics.object.width)
+            found = Alignment.load(config.alignment).place(found, config.optics.object.width)
         return one.name, found
 
     return dict(config.read_all("targets", levels, "path"))

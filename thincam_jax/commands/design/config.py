@@ -239,7 +239,7 @@ class ValidateConfig(Section):
     reconstruction: Literal["wiener", "admm_tv", "pnp"] = "wiener"
 
 
-class TrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))):
+class DesignTrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))):
     """Designs improved by the error of an actual reconstruction.
 
     - `images`: photographs of scikit-image; their middle square is taken.
@@ -273,7 +273,7 @@ class DesignConfig(LenslessConfig):
     reference: ReferenceConfig
     compare: tuple[RivalConfig, ...] = ()
     search: SearchConfig
-    train: TrainingConfig | None = None
+    train: DesignTrainingConfig | None = None
     pareto: ParetoConfig | None = None
     targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
     # Not `validate`, which pydantic has for itself.

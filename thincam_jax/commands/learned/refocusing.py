@@ -72,7 +72,7 @@ class NetworkConfig(section(NetworkOptions)):
 _LESSONS = ("batch", "pool", "judged")
 
 
-class TrainingConfig(section(TrainingOptions, Lessons, only=(*TRAINING, *_LESSONS))):
+class RefocusTrainingConfig(section(TrainingOptions, Lessons, only=(*TRAINING, *_LESSONS))):
     """See `learn.training.TrainingOptions`; `batch`, `pool`, `judged`: see `learn.Lessons`."""
 
 
@@ -87,7 +87,7 @@ class LearnedConfig(LenslessConfig, LearningConfig):
     sources: Annotated[tuple[SourceConfig, ...], Field(min_length=1)]
     scenes: ScenesConfig = ScenesConfig()
     network: NetworkConfig = NetworkConfig()
-    training: TrainingConfig = TrainingConfig()
+    training: RefocusTrainingConfig = RefocusTrainingConfig()
     notes: tuple[str, ...] = ()
 
 

@@ -59,7 +59,7 @@ class Job:
         return self.images[0].suffix.lower() == ".png"
 
 
-class Rig:
+class Inputs:
     """`Sources`, read once."""
 
     def __init__(self, sources: Sources):
@@ -102,7 +102,9 @@ class Rig:
         psf, (image,) = examined.psf, examined.captures
         assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}
-        return measured.prepare(psf, image, background, self.sources.preparation, **known)
+        return measured.prepare(
+            psf, image, background=background, options=self.sources.preparation, **known
+        )
 
     def tell(self, findings: Sequence[Finding], strict: bool) -> None:
         """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
@@ -140,7 +142,7 @@ class Rig:
 
     def _image(self, path: Path, exposure: float | None, bits: int | None) -> measured.Raw:
         """An image with its exposure and the dead pixels of the map, where that has its size."""
-        image = measured.read_image(path, bits)
+        image = measured.read_image(path, bits=bits)
         said, size = image.exposure or exposure, image.pixels.shape[:2]
         if said and exposure and abs(said / exposure - 1) > 0.1:  # more than rounded
             text = (

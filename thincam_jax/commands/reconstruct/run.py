@@ -16,7 +16,7 @@ from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.interrupt import INTERRUPTED
-from thincam_jax.commands.reconstruct.jobs import Job, Rig, write_job
+from thincam_jax.commands.reconstruct.jobs import Inputs, Job, write_job
 from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
 from thincam_jax.measured.examination import Finding, finding
@@ -92,7 +92,7 @@ def run_jobs(
 
     **Errors**: MeasurementError, one line, for sources that cannot be read.
     """
-    rig, focused = Rig(sources), []
+    rig, focused = Inputs(sources), []
     for job in jobs:
         try:
             if job.focus is None:
@@ -110,7 +110,9 @@ def run_jobs(
             return
 
 
-def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report | None) -> Finished:
+def _run_job(
+    job: Job, rig: Inputs, recipe: Recipe, output: Output, report: Report | None
+) -> Finished:
     began = time.perf_counter()
     examined, background = rig.examine(job)
     known = background not in (None, "found") or examined.captures[0].black_level is not None
@@ -152,7 +154,7 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
     return replace(made, record=record, image=image, line=f"{job.images[0]}: {made.line}")
 
 
-def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finished:
+def _join(job: Job, images: list[np.ndarray], rig: Inputs, output: Output) -> Finished:
     """The image that is sharp everywhere, with the depth map; of one image for each distance."""
     from thincam_jax.plot.frame import as_png
     from thincam_jax.plot.refocus import draw_depth, draw_sweep
@@ -340,7 +342,7 @@ def check_files(
     """
     if out is not None and out.suffix.lower() not in LINEAR:
         raise measured.MeasurementError(f"--refine {out}: give a file .npy or .tif")
-    rig = Rig(sources)
+    rig = Inputs(sources)
     ready = rig.prepare(capture)
     shape, block = ready.capture.shape[-2:], sources.preparation.downsample
     recording = prepared_recording(ready)
@@ -359,14 +361,14 @@ def check_files(
         return [*lines, str(better), "nothing written"], found.fits
     whole = replace(sources, preparation=replace(sources.preparation, downsample=1))
     changes = better.values | {"blur": better.values.get("blur", 0.0) * block**2}
-    psf = changed_psf(Rig(whole).prepare(capture).psf, changes)
+    psf = changed_psf(Inputs(whole).prepare(capture).psf, changes)
     measured.write_image(out, _BRIGHTEST * psf / psf.max())
     return [*lines, str(better), f"written: --psf {out} --psf-background 0"], True
 
 
 def enough_blocks(sources: Sources, capture: Path) -> Sources:
     """Sources with blocks that leave some 160 pixels of a side, 320 where these blur the PSF."""
-    whole = Rig(sources).prepare(capture)
+    whole = Inputs(sources).prepare(capture)
     side = max(whole.capture.shape[-2:])
     fine, coarse = (max(1, round(side / pixels)) for pixels in (2 * _SIDE, _SIDE))
     block = fine if blocks_blur(whole.psf, fine) else coarse

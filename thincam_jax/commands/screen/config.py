@@ -72,7 +72,7 @@ class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
     height: Length
 
     def build(self, **others: Any) -> wg.Rectangle:
-        return wg.Rectangle((self.x, self.y), (self.width, self.height))
+        return wg.Rectangle((self.y, self.x), (self.height, self.width))
 
 
 class PlateConfig(section(wg.Screen, without=("hologram",), defaults={"glass_index": 1.5})):
@@ -146,7 +146,7 @@ class ModelConfig(section(ScreenModel, without=("name",))):
     name: Name
 
 
-class PublishedConfig(section(PublishedImage, defaults={"psnr_db": ..., "seconds": ...})):
+class PublishedImageConfig(section(PublishedImage, defaults={"psnr_db": ..., "seconds": ...})):
     """Published figures of a target."""
 
 
@@ -156,7 +156,7 @@ class ScreenTargetConfig(PictureConfig):
     - `published`: by the method's name.
     """
 
-    published: dict[str, PublishedConfig] = {}
+    published: dict[str, PublishedImageConfig] = {}
 
 
 class CalibrationConfig(section(Calibration)):

@@ -80,7 +80,7 @@ def build_mask(config: ScreenConfig) -> ScreenMask | None:
 def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
     """The cells before the camera."""
     seen = config.object
-    return wg.ObjectPlane(seen.cells, seen.distance, seen.width, (seen.x, seen.y))
+    return wg.ObjectPlane(seen.cells, seen.distance, seen.width, (seen.y, seen.x))
 
 
 def build_cameras(config: SeeThroughConfig) -> tuple[wg.SeeThroughCamera, ...]:

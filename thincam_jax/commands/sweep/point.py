@@ -124,7 +124,7 @@ def _digest(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Metrics:
     """The metrics of a point by column; or why there are none, in one line, and the traceback."""
 
     metrics: dict[str, Any] | None
@@ -132,15 +132,15 @@ class Outcome:
     traceback: str | None = None
 
 
-def measure_point(config: str, double: bool) -> Outcome:
+def measure_point(config: str, double: bool) -> Metrics:
     """The metrics of a resolved study, given as JSON; an error is an outcome too."""
     try:
         with double_precision(double):
-            return Outcome(metrics_row(build_study(StudyConfig.model_validate_json(config))))
+            return Metrics(metrics_row(build_study(StudyConfig.model_validate_json(config))))
     except _USER_ERRORS as error:
-        return Outcome(None, "; ".join(str(error).splitlines()))
+        return Metrics(None, "; ".join(str(error).splitlines()))
     except Exception as error:  # a sweep goes on without a point that shows a defect
-        return Outcome(None, one_line(error), traceback.format_exc())
+        return Metrics(None, one_line(error), traceback.format_exc())
 
 
 def one_line(error: BaseException) -> str:

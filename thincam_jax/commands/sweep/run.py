@@ -12,7 +12,7 @@ from pyarrow import csv
 
 from thincam_jax._core.files import write_whole
 from thincam_jax.commands.run_folder import RunFolder, read_entries
-from thincam_jax.commands.sweep.point import GridPoint, Outcome, described, measure_point, one_line
+from thincam_jax.commands.sweep.point import GridPoint, Metrics, described, measure_point, one_line
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 
 _PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
@@ -38,7 +38,7 @@ class SweepFolder(RunFolder):
         """Whether the point has succeeded before; a row that cannot be read does not count."""
         return read_row(self._row(point)) is not None
 
-    def keep(self, point: GridPoint, outcome: Outcome) -> None:
+    def keep(self, point: GridPoint, outcome: Metrics) -> None:
         """Write what became of a point."""
         if outcome.metrics is None:
             record = {"point": point.key, "values": point.values, "reason": outcome.reason}
@@ -147,7 +147,7 @@ def run_sweep(
     *,
     scheduler: str | None = None,
     workers: int | None = None,
-    measure: Callable[[str, bool], Outcome] = measure_point,
+    measure: Callable[[str, bool], Metrics] = measure_point,
 ) -> Swept:
     """Measure every point that has no row in the folder, which must have been claimed.
 
@@ -161,7 +161,7 @@ def run_sweep(
     done, failed = len(points) - len(todo), 0
     progress(done, failed)
 
-    def keep(point: GridPoint, outcome: Outcome) -> None:
+    def keep(point: GridPoint, outcome: Metrics) -> None:
         nonlocal done, failed
         done, failed = done + 1, failed + (outcome.metrics is None)
         progress(done, failed)
@@ -171,7 +171,7 @@ def run_sweep(
     try:
         for point in todo.values():
             if point.config is None:
-                keep(point, Outcome(None, point.reason))
+                keep(point, Metrics(None, point.reason))
         if runnable:
             local = scheduler is None
             work = local_workers(workers, len(runnable)) if local else scheduled_workers(scheduler)
@@ -203,11 +203,11 @@ def _tried_twice(
         yield from outcomes(measure, {name: tasks[name]})
 
 
-def _outcome(result: Any) -> Outcome:
+def _outcome(result: Any) -> Metrics:
     """A worker that dies and a worker without the package have their reasons too."""
-    if isinstance(result, Outcome):
+    if isinstance(result, Metrics):
         return result
-    return Outcome(None, "worker died" if isinstance(result, Died) else one_line(result))
+    return Metrics(None, "worker died" if isinstance(result, Died) else one_line(result))
 
 
 def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from thincam_jax._core.capture_store import (
 )
 from thincam_jax._core.text import of_error, shortened
 from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
-from thincam_jax.hardware.acquisition.plan import BLACK, Plan, settings_from
+from thincam_jax.hardware.acquisition.plan import BLACK, AcquisitionPlan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
     Recorder,
     create_store,
@@ -42,7 +42,7 @@ from thincam_jax.hardware.errors import NotHomed, OutOfRange
 
 
 @dataclass(frozen=True)
-class Progress:
+class AcquisitionProgress:
     """State after each frame: frames taken and in all, frames per second, and s remaining."""
 
     done: int
@@ -52,7 +52,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class AcquisitionOutcome:
     """End of a run.
 
     - `done`, `total`: frames in the store, and of the plan.
@@ -75,13 +75,13 @@ class Outcome:
 
 
 def acquire(
-    plan: Plan,
+    plan: AcquisitionPlan,
     rig: Rig,
     path: str | Path,
     *,
     procedure: Procedure | None = None,
-    progress: Callable[[Progress], None] | None = None,
-) -> Outcome:
+    progress: Callable[[AcquisitionProgress], None] | None = None,
+) -> AcquisitionOutcome:
     """Take the frames of a plan into the store at `path`, or those that it lacks.
 
     Ctrl-C and SIGTERM stop after the present frame, a second Ctrl-C at once. Frames taken are kept,
@@ -113,13 +113,13 @@ def acquire(
                 done += 1
                 if progress is not None:
                     rate = count / max(time.monotonic() - started, 1e-9)
-                    progress(Progress(done, total, rate, (total - done) / rate))
+                    progress(AcquisitionProgress(done, total, rate, (total - done) / rate))
     found = []
     if procedure.exposure == "auto":
         found.append(f"exposure {1000 * settings[0].exposure:.4g} ms")
     if procedure.settle is None:
         found.append(f"settle time {1000 * (run.procedure.settle or 0.0):.3g} ms")
-    return Outcome(path, done, total, tuple(found), tuple(run.recovered), run.seconds)
+    return AcquisitionOutcome(path, done, total, tuple(found), tuple(run.recovered), run.seconds)
 
 
 def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:

@@ -56,7 +56,7 @@ BLACK, WHITE = Pattern("black"), Pattern("uniform", {"level": 255})
 
 @checked
 @dataclass(frozen=True)
-class Step:
+class AcquisitionStep:
     """One frame: its pattern and settings by their number in the plan, and the stage position.
 
     - `position`: mm; None: the stage stays where the steps before left it.
@@ -71,12 +71,12 @@ class Step:
 
 @checked
 @dataclass(frozen=True)
-class Plan:
+class AcquisitionPlan:
     """An ordered list of steps.
 
     - `name`: its purpose, such as "method_b".
     - `facts`: numbers and texts stored with the captures. `stage_zero` is the distance, mm, at the
-      stage's position 0. With `series`, as in `hadamard`, `open_captures` reads the store. With
+      stage's position 0. With `series`, as in `hadamard`, it makes `HadamardCaptures`. With
       `bracket`, frames of all but the shortest exposure may be saturated.
 
     **Errors**: ValueError for no steps, numbers that point outside of the tables, and what JSON
@@ -86,7 +86,7 @@ class Plan:
     name: str
     patterns: tuple[Pattern, ...]
     settings: tuple[CameraSettings, ...]
-    steps: tuple[Step, ...]
+    steps: tuple[AcquisitionStep, ...]
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -102,15 +102,15 @@ class Plan:
                     )
         _ = self.hash  # refuses NaN and objects now, not after the first frame
 
-    def pattern(self, step: Step) -> Pattern:
+    def pattern(self, step: AcquisitionStep) -> Pattern:
         """Pattern shown in a step of this plan."""
         return self.patterns[step.pattern]
 
-    def at_position(self, position: float) -> "Plan":
+    def at_position(self, position: float) -> "AcquisitionPlan":
         """The plan with the stage at a position, mm, until a step moves it."""
         return dataclasses.replace(self, steps=self.placed(position))
 
-    def placed(self, start: float | None = None) -> tuple[Step, ...]:
+    def placed(self, start: float | None = None) -> tuple[AcquisitionStep, ...]:
         """The steps, each with the stage's position, mm: the last given one, `start` before any."""
         steps = []
         for step in self.steps:
@@ -143,14 +143,14 @@ class Plan:
             ) from error
 
     @classmethod
-    def from_json(cls, text: str) -> "Plan":
+    def from_json(cls, text: str) -> "AcquisitionPlan":
         """Inverse of `as_json`; errors of many kinds for anything else."""
         plan = json.loads(text)
         return cls(
             name=plan["name"],
             patterns=tuple(Pattern(kind, numbers) for kind, numbers in plan["patterns"]),
             settings=tuple(settings_from(record) for record in plan["settings"]),
-            steps=tuple(Step(*step) for step in plan["steps"]),
+            steps=tuple(AcquisitionStep(*step) for step in plan["steps"]),
             facts=plan["facts"],
         )
 

@@ -11,7 +11,7 @@ from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, fra
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.text import of_error
 from thincam_jax.hardware.acquisition.journal import frame_records, read_journal
-from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
+from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge_exposures
@@ -20,7 +20,7 @@ from thincam_jax.measured.raw import Raw
 
 @dataclass(frozen=True)
 class Acquisition:
-    """A complete acquisition, as read by `read_acquisition`.
+    """A complete acquisition.
 
     - `settings`: actual camera settings, one for each of `plan.settings`.
     - `shots`: a record for each step: "digest", "taken" (UTC), the camera's "number" and "time"
@@ -29,12 +29,50 @@ class Acquisition:
     """
 
     path: Path
-    plan: Plan
+    plan: AcquisitionPlan
     settings: tuple[CameraSettings, ...]
     bits: int
     sensor_shape: tuple[int, int]
     shots: tuple[Mapping[str, Any], ...]
     provenance: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Acquisition":
+        """Read a complete acquisition; `HadamardCaptures.load` reads one of a Hadamard plan, too.
+
+        **Errors**: CaptureStoreError, one line, for another store, and for one that lacks frames.
+        """
+        path = Path(path)
+        store = CaptureStore(path)
+        attributes = store.attributes
+        try:
+            begun = dict(attributes["acquisition"])
+            plan = AcquisitionPlan.from_json(read_regular(path / PLAN).decode("utf-8"))
+            settings = tuple(settings_from(record) for record in begun.pop("settings"))
+            if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):
+                raise ValueError("its plan is another one")
+        except Exception as error:  # whatever another's plan or attributes bring about
+            raise CaptureStoreError(
+                f"{path} is not what an acquisition made ({of_error(error)}); give a store of "
+                "acquire()"
+            ) from error
+        shots = frame_records(path / JOURNAL, read_journal(path / JOURNAL), len(plan.steps))
+        missing = sorted({n for n in range(len(plan.steps)) if n not in shots} | store.lost())
+        if missing:
+            raise CaptureStoreError(
+                f"{path}: {len(missing)} of {len(plan.steps)} frames are missing: {listed(missing)}"
+                "; run the same acquisition again to take them"
+            )
+        rows, columns = attributes["sensor_shape"]
+        return cls(
+            path,
+            plan,
+            settings,
+            attributes["bits"],
+            (rows, columns),
+            tuple(shots[number] for number in range(len(plan.steps))),
+            begun,
+        )
 
     @property
     def lit(self) -> list[int]:
@@ -125,40 +163,3 @@ class Acquisition:
         exposure, found = self.settings[0].exposure, self.merged()
         frame = (exposure * found.rate)[None].astype(np.float32)
         return frame, exposure**2 * found.variance
-
-
-def read_acquisition(path: str | Path) -> Acquisition:
-    """Read a complete acquisition; one of a Hadamard plan is also read by `open_captures`.
-
-    **Errors**: CaptureStoreError, one line, for another store, and for one that lacks frames.
-    """
-    path = Path(path)
-    store = CaptureStore(path)
-    attributes = store.attributes
-    try:
-        begun = dict(attributes["acquisition"])
-        plan = Plan.from_json(read_regular(path / PLAN).decode("utf-8"))
-        settings = tuple(settings_from(record) for record in begun.pop("settings"))
-        if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):
-            raise ValueError("its plan is another one")
-    except Exception as error:  # whatever another's plan or attributes bring about
-        raise CaptureStoreError(
-            f"{path} is not what an acquisition made ({of_error(error)}); give a store of acquire()"
-        ) from error
-    shots = frame_records(path / JOURNAL, read_journal(path / JOURNAL), len(plan.steps))
-    missing = sorted({n for n in range(len(plan.steps)) if n not in shots} | store.lost())
-    if missing:
-        raise CaptureStoreError(
-            f"{path}: {len(missing)} of {len(plan.steps)} frames are missing: {listed(missing)}; "
-            "run the same acquisition again to take them"
-        )
-    rows, columns = attributes["sensor_shape"]
-    return Acquisition(
-        path,
-        plan,
-        settings,
-        attributes["bits"],
-        (rows, columns),
-        tuple(shots[number] for number in range(len(plan.steps))),
-        begun,
-    )

@@ -8,7 +8,7 @@ import numpy as np
 
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
 from thincam_jax.hardware import plans
-from thincam_jax.hardware.acquisition.plan import WHITE, Pattern, Plan
+from thincam_jax.hardware.acquisition.plan import WHITE, AcquisitionPlan, Pattern
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.lensless.masks.fza import PROFILES, Profile
 from thincam_jax.measured.calibration.alignment import MapKind
@@ -175,7 +175,7 @@ class PlanRequest:
         stage_zero: float = 0.0,
         shown: Mapping[str, np.ndarray] | None = None,
         mask: Pattern = WHITE,
-    ) -> Plan:
+    ) -> AcquisitionPlan:
         """The steps.
 
         - `stage_zero`: distance at the stage's position 0, mm.

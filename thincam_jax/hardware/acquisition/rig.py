@@ -75,9 +75,9 @@ class Rig(AbstractContextManager["Rig"]):
 def open_rig(
     drivers: Mapping[Role, tuple[str, Mapping[str, Any]]],
     pitch: float,
+    *,
     virtual: "VirtualRig | None" = None,
     pictures: Mapping[str, np.ndarray] | None = None,
-    *,
     turns_phase: bool = False,
 ) -> Iterator[Rig]:
     """Open the devices of a rig and home its stage; a context manager.

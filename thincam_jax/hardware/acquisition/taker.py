@@ -16,7 +16,7 @@ import numpy as np
 
 from thincam_jax._core.quantity import check_fields, choice, quantity, whole
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
-from thincam_jax.hardware.acquisition.plan import Plan, Step
+from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.acquisition.rig import Rig, Role
 from thincam_jax.hardware.base import CameraSettings, Frame, grab
 from thincam_jax.hardware.errors import (
@@ -69,7 +69,7 @@ class Taker:
     - `recovered`: the errors that a retry resolved. `seconds`: spent on each part of a step.
     """
 
-    def __init__(self, plan: Plan, rig: Rig, procedure: Procedure):
+    def __init__(self, plan: AcquisitionPlan, rig: Rig, procedure: Procedure):
         self.plan, self.rig, self.procedure = plan, rig, procedure
         self.steps = plan.placed()
         self.recovered: list[str] = []
@@ -96,7 +96,7 @@ class Taker:
             self.seconds[what] = self.seconds.get(what, 0.0) + spent
 
     def take(
-        self, step: Step, settings: CameraSettings, *, probe: bool = False
+        self, step: AcquisitionStep, settings: CameraSettings, *, probe: bool = False
     ) -> tuple[Frame, dict[str, Any]]:
         """Frame of a step, and its record for the journal. A `probe` may be saturated."""
         before = len(self.recovered)
@@ -157,7 +157,7 @@ class Taker:
         self._position: float | None = None
 
     def _once(
-        self, step: Step, settings: CameraSettings, probe: bool
+        self, step: AcquisitionStep, settings: CameraSettings, probe: bool
     ) -> tuple[Frame, dict[str, Any]]:
         """Frame of a step, its number of saturated pixels, and the stage's position."""
         position = self._moved(step)
@@ -185,7 +185,7 @@ class Taker:
         self._last = frame.number
         return frame, {"saturated": saturated, "position": position}
 
-    def _moved(self, step: Step) -> float | None:
+    def _moved(self, step: AcquisitionStep) -> float | None:
         """Reported position of the stage after its move; None without a stage."""
         stage = self.rig.stage
         if stage is None:
@@ -224,7 +224,7 @@ class Taker:
         self._configured = self.rig.camera.configure(settings)
         return self._configured
 
-    def _refuse_repeated(self, step: Step, pixels: np.ndarray) -> None:
+    def _refuse_repeated(self, step: AcquisitionStep, pixels: np.ndarray) -> None:
         """Refuse identical pixels for another pattern: with new noise they would differ."""
         middle = len(pixels) // 2  # compared first, as it nearly always differs
         if (
@@ -241,7 +241,7 @@ class Taker:
             )  # fmt: skip
         self._seen = step.pattern, pixels
 
-    def _is_bracketed(self, step: Step) -> bool:
+    def _is_bracketed(self, step: AcquisitionStep) -> bool:
         """Whether a shorter exposure of the plan sees what this one saturates."""
         exposures = [one.exposure for one in self.plan.settings]
         bracket = bool(self.plan.facts.get("bracket"))

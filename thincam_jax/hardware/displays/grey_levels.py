@@ -46,13 +46,13 @@ class GreyLevels:
         """Levels to show for a pattern of uint8."""
         return self.table[pattern]
 
-    def write(self, path: str | PathLike[str]) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write the table with its provenance as a JSON file."""
         content = {"table": self.table.tolist(), "provenance": dict(self.provenance)}
         write_whole(path, json.dumps(content, indent=1) + "\n")
 
     @classmethod
-    def read(cls, path: str | PathLike[str]) -> "GreyLevels":
+    def load(cls, path: str | PathLike[str]) -> "GreyLevels":
         """Read the table of a file; ValueError, one line, for an invalid one."""
         try:
             content = read_json(path)
@@ -64,7 +64,7 @@ class GreyLevels:
             raise ValueError(f"{path} holds no table of grey levels: {error}") from error
 
 
-class Screen(Display):
+class GreyLevelDisplay(Display):
     """A display of 256 levels, with `grey_levels` in equal steps of the irradiance."""
 
     def __init__(self, grey_levels: GreyLevels | None = None):

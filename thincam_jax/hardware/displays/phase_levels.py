@@ -52,12 +52,12 @@ class PhaseLevels:
             given = f"{len(self.phases)} phases; give 2 to {LEVELS}, from level 0 to 255"
             raise FieldError(given, "phases")
 
-    def write(self, path: str | PathLike[str]) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write the table as a JSON file."""
         write_whole(path, json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
-    def read(cls, path: str | PathLike[str]) -> "PhaseLevels":
+    def load(cls, path: str | PathLike[str]) -> "PhaseLevels":
         """Read the table of a file; ValueError, one line, for an invalid one."""
         try:
             content = read_json(path)

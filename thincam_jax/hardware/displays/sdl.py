@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax.hardware.base import Connected, Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
 from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
 
 with warnings.catch_warnings():
@@ -20,7 +20,7 @@ _GREY = np.uint32(0x010101)  # red, green and blue alike
 _NOT_SHOWN = sdl2.SDL_WINDOW_HIDDEN | sdl2.SDL_WINDOW_MINIMIZED
 
 
-class SdlDisplay(Screen):
+class SdlDisplay(GreyLevelDisplay):
     """A borderless window without a cursor, pixel by pixel.
 
     `show` returns after the monitor's next refresh if the driver supports `vsync`. Only the thread
@@ -40,7 +40,7 @@ class SdlDisplay(Screen):
         grey_levels: str = ""
 
     def __init__(self, options: Options):
-        super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
+        super().__init__(GreyLevels.load(options.grey_levels) if options.grey_levels else None)
         self._window: Any = None
         for hint, value in (
             (sdl2.SDL_HINT_NO_SIGNAL_HANDLERS, b"1"),  # Ctrl-C stays with Python

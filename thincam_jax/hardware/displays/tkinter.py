@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
 from thincam_jax.hardware.errors import Disconnected, NotFound
 
 
-class TkinterDisplay(Screen):
+class TkinterDisplay(GreyLevelDisplay):
     """A borderless window. It waits for the window system, not for the monitor's next refresh.
 
     Only the thread that opened it may use it.
@@ -30,7 +30,7 @@ class TkinterDisplay(Screen):
         grey_levels: str = ""
 
     def __init__(self, options: Options):
-        super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
+        super().__init__(GreyLevels.load(options.grey_levels) if options.grey_levels else None)
         try:
             self._root = tkinter.Tk()
         except tkinter.TclError as error:

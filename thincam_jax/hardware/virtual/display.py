@@ -7,13 +7,13 @@ from importlib.metadata import version
 import numpy as np
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
 from thincam_jax.hardware.virtual.faults import Faults
 
 _LATENCY = 0.05  # s
 
 
-class VirtualDisplay(Screen):
+class VirtualDisplay(GreyLevelDisplay):
     """A display that calls `on_show` with the levels (y, x), uint8, of each pattern.
 
     `faults`: plays latency, a late `show`.

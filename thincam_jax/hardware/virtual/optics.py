@@ -27,7 +27,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.sampled import SampledMask
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 from thincam_jax.measured.bayer import Pattern, mosaic
@@ -149,7 +149,7 @@ def _middle(shown: np.ndarray) -> np.ndarray:
 def pixelated_psf(
     amplitude: Float[np.ndarray, "v u"] | Complex[np.ndarray, "v u"],
     grid: Grid,
-    path: Path,
+    path: LightPath,
     *,
     pixel_pitch: float,
     fill_factor: float = 1.0,
@@ -199,7 +199,7 @@ def _slit_fields(
     x: Float[Array, "node n"],
     count: int,
     slit: tuple[Float[Array, ""], Float[Array, ""]],
-    path: Path,
+    path: LightPath,
 ) -> Complex[Array, "node n cell"]:
     """One-dimensional field at x behind each of the display's open pixels, and behind all of it.
 

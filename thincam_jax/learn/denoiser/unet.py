@@ -10,7 +10,7 @@ from thincam_jax.learn.refocusing.unet import blocks_to_channels, channels_to_bl
 _IMAGES = 5  # of the input: the four pixels of a block, and the noise level
 
 
-class Residual(eqx.Module):
+class ResidualKernels(eqx.Module):
     """x + C₂ ReLU(C₁ x), with 3×3 convolutions."""
 
     first: Float[Array, "c c 3 3"]
@@ -31,8 +31,8 @@ class Level(eqx.Module):
     `before` and `after` are residual blocks, `down` makes one pixel of 2×2, `up` 2×2 of one.
     """
 
-    before: tuple[Residual, ...]
-    after: tuple[Residual, ...]
+    before: tuple[ResidualKernels, ...]
+    after: tuple[ResidualKernels, ...]
     down: Float[Array, "coarse fine 2 2"] | None
     up: Float[Array, "fine_of_four coarse 1 1"] | None
     inner: "Level | None"
@@ -40,10 +40,10 @@ class Level(eqx.Module):
     def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...], *, key: PRNGKeyArray):
         (width, *coarser), (count, *others) = widths, blocks
         keys = jax.random.split(key, 2 * count + 3)
-        self.before = tuple(Residual(width, key=one) for one in keys[:count])
+        self.before = tuple(ResidualKernels(width, key=one) for one in keys[:count])
         self.after, self.down, self.up, self.inner = (), None, None, None
         if coarser:
-            self.after = tuple(Residual(width, key=one) for one in keys[count : 2 * count])
+            self.after = tuple(ResidualKernels(width, key=one) for one in keys[count : 2 * count])
             self.down = 0.7 * _kernel(width, coarser[0], 2, keys[-3])
             self.up = 0.7 * _kernel(coarser[0], 4 * width, 1, keys[-2])
             self.inner = Level(tuple(coarser), tuple(others), key=keys[-1])

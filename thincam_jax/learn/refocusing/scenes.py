@@ -73,7 +73,7 @@ _CUT, _LAYER = 8, 5
 _NUMBERS = (_CUT, COVER_NUMBERS, RELIEF_NUMBERS)
 
 
-class Scene(eqx.Module):
+class LayeredScene(eqx.Module):
     """Layers from the front to the back, in directions: pixel (i, j) is one ray through the mask.
 
     - `radiance`: F, (layer, y, x); `cover`: α, (layer, y, x), 0 to 1.
@@ -147,7 +147,7 @@ class Batch(eqx.Module):
     all_in_focus: Float[Array, "*element y x"]
     inverse: Float[Array, "*element y x"]
     emission: Float[Array, "*element layer part y x"]
-    scene: Scene
+    scene: LayeredScene
 
     @property
     def distance(self) -> Float[Array, "*element y x"]:
@@ -164,7 +164,7 @@ def draw_scene(
     images: Float[ArrayLike, "image side side"],
     camera: RefocusCamera,
     options: SceneOptions = DEFAULT,
-) -> Scene:
+) -> LayeredScene:
     """A random scene of pictures cut out of `images` anywhere, at any scale."""
     dtype, shape = camera.near.dtype, camera.field_shape
     drawn = jax.random.uniform(key, (LAYERS, sum(_NUMBERS) + _LAYER), dtype)
@@ -178,7 +178,7 @@ def draw_scene(
     is_dark = (number > 1) & (layer[0, 1] < options.dark)
     there = there.at[-1].set(jnp.where(is_dark, 0, 1).astype(dtype))
     inverse, share = _depths(layer[:, 2:], relief, camera, options)
-    return Scene(radiance, cover * there[:, None, None], share, inverse)
+    return LayeredScene(radiance, cover * there[:, None, None], share, inverse)
 
 
 def _depths(layer, relief, camera: RefocusCamera, options: SceneOptions):

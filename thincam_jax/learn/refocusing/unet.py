@@ -23,7 +23,7 @@ class Convolution(eqx.Module):
         return convolved(image, self.weight) + self.bias.astype(image.dtype)
 
 
-class Residual(eqx.Module):
+class ResidualConvolutions(eqx.Module):
     """x + C₂ ReLU(C₁ x)."""
 
     first: Convolution
@@ -50,8 +50,8 @@ class UNet(eqx.Module):
 
     enter: Convolution
     down: tuple[Convolution, ...]
-    before: tuple[Residual, ...]
-    after: tuple[Residual, ...]
+    before: tuple[ResidualConvolutions, ...]
+    after: tuple[ResidualConvolutions, ...]
     up: tuple[Convolution, ...]
     leave: Convolution
 
@@ -61,8 +61,8 @@ class UNet(eqx.Module):
         self.enter = Convolution(4 * inputs, widths[0], key=next(keys))
         self.down = tuple(Convolution(a, b, key=next(keys)) for a, b in pairs)
         self.up = tuple(Convolution(b, a, key=next(keys)) for a, b in pairs)
-        self.before = tuple(Residual(n, key=next(keys)) for n in widths)
-        self.after = tuple(Residual(n, key=next(keys)) for n in widths[:-1])
+        self.before = tuple(ResidualConvolutions(n, key=next(keys)) for n in widths)
+        self.after = tuple(ResidualConvolutions(n, key=next(keys)) for n in widths[:-1])
         self.leave = Convolution(widths[0], 4 * outputs, gain=0.0, key=next(keys))
 
     def __call__(self, images: Float[Array, "input y x"]) -> Float[Array, "output y x"]:

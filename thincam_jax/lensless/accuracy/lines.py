@@ -22,7 +22,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     propagate,
     spherical_wave,
 )
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
 # Rows and columns that are looked at. All sizes have this many, so that nothing recompiles.
@@ -101,7 +101,7 @@ def chosen(
 def angular_spectrum_terms(
     mask: AbstractFactoredMask,
     points: SparseGrid,
-    path: Path,
+    path: LightPath,
     shape: tuple[int, int],
     method: PsfMethod,
 ) -> SeparableSum:
@@ -127,7 +127,7 @@ def angular_spectrum_terms(
     return SeparableSum(weights[:, None] * factors[0], factors[1], points)
 
 
-def _by_transform(lit, pitch, path: Path, size: int, fine) -> Complex[Array, "order n"]:
+def _by_transform(lit, pitch, path: LightPath, size: int, fine) -> Complex[Array, "order n"]:
     """Propagated on a window of `size` samples, taken where `fine` samples lie."""
     count = lit.shape[-1]
     padded = jnp.pad(lit, ((0, 0), (0, size - count)))
@@ -139,7 +139,7 @@ def _by_transform(lit, pitch, path: Path, size: int, fine) -> Complex[Array, "or
 @functools.partial(jax.jit, static_argnames=("samples", "axis"))
 def fine_fields(
     mask: AbstractFactoredMask,
-    path: Path,
+    path: LightPath,
     reach: Float[Array, ""],
     exact: Bool[Array, ""],
     samples: int,

@@ -25,7 +25,7 @@ from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
@@ -74,7 +74,7 @@ class Numbers:
     largest_phase: float
 
 
-def lines_of(mask: AbstractFactoredMask, grid: Grid, path: Path) -> Lines:
+def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
     """Rows and columns of the grid, denser at the edges of the shadow."""
     pitch, scale = float(grid.pitch), float(path.magnification)
     shadow = path.on_mask(grid, mask.centre)
@@ -91,7 +91,7 @@ def lines_of(mask: AbstractFactoredMask, grid: Grid, path: Path) -> Lines:
 
 @jax.jit(static_argnames=("shape", "method"))
 def _direct_sum(
-    mask, points: SparseGrid, path: Path, shape: tuple[int, int], method: PsfMethod
+    mask, points: SparseGrid, path: LightPath, shape: tuple[int, int], method: PsfMethod
 ) -> Float[Array, "row column"]:
     """`rayleigh_sommerfeld` at some pixels."""
     plane, _ = planes(Grid(shape, points.pitch), method)
@@ -103,7 +103,7 @@ def _direct_sum(
 
 
 @jax.jit
-def _fine_lines(mask: AbstractFactoredMask, half_sensor: Array, path: Path, exact: Array):
+def _fine_lines(mask: AbstractFactoredMask, half_sensor: Array, path: LightPath, exact: Array):
     """Fields on lines through the axis, their half length, and the pairs of their orders.
 
     One line stands for both axes where the mask's factors are the same.
@@ -197,13 +197,13 @@ class MaskProbe:
     """
 
     def __init__(
-        self, mask: AbstractFactoredMask, grid: Grid, path: Path, *, pixel_integration: bool
+        self, mask: AbstractFactoredMask, grid: Grid, path: LightPath, *, pixel_integration: bool
     ) -> None:
         self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
         self.lines = lines_of(mask, grid, path)
         # Those of few fringes differ by rounding, and each count is compiled.
         self.nodes = max(PIXEL_NODES, pixel_nodes(mask, grid, path, "float64"))
-        self.given: dict[Precision, tuple[AbstractFactoredMask, Array, Path]]
+        self.given: dict[Precision, tuple[AbstractFactoredMask, Array, LightPath]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
         self._cache: dict[tuple[Model, Precision, int], Factors] = {}

@@ -47,7 +47,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     planes,
     propagate,
 )
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import PROFILE_ERROR, profile_samples, radial
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.sampling import samples_needed
@@ -67,7 +67,7 @@ SAMPLED_ROUNDING = {precision: 100 * rounding for precision, rounding in RESULT_
 def sampled_errors(
     mask: AbstractMask,
     grid: Grid,
-    path: Path,
+    path: LightPath,
     pixel_integration: bool,
     norm: Callable[[Float[Array, "y x"]], Float[Array, ""] | float] = jnp.linalg.norm,
 ) -> Iterator[tuple[PsfMethod, float]]:
@@ -122,7 +122,7 @@ def _richardson(
         before = after
 
 
-def _field_rounding(mask: AbstractMask, grid: Grid, path: Path) -> float:
+def _field_rounding(mask: AbstractMask, grid: Grid, path: LightPath) -> float:
     """Relative error that the precision leaves in the field's square, from some of its pixels."""
     if precision_of(grid.pitch) == "float64":
         return SAMPLED_ROUNDING["float64"]
@@ -142,7 +142,7 @@ def _spread_pixels(grid: Grid) -> SparseGrid:
 
 
 @jax.jit(static_argnames="method")
-def _field(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _field(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     if not isinstance(mask, AbstractFactoredMask):
         average = method.nodes is not None
         return radial(mask, grid, path, PsfMethod("radial", None, average, nodes=method.nodes))
@@ -150,7 +150,7 @@ def _field(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
 
 
 @jax.jit(static_argnames="method")
-def _cut_by_window(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _cut_by_window(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     """Relative difference of lines of the mask's middle from those of a wider window."""
     plane, sensor = planes(grid, method)
     strip, squares = min(_PART * method.samples, *plane.shape), jnp.zeros((), grid.pitch.dtype)
@@ -166,7 +166,7 @@ def _cut_by_window(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
 
 
 @jax.jit(static_argnames=("count", "padding"))
-def _lines(fields: Complex[Array, "line m"], pitch, path: Path, count: int, padding: float):
+def _lines(fields: Complex[Array, "line m"], pitch, path: LightPath, count: int, padding: float):
     """Irradiance on the middle `count` samples of each, in a window padded as the PSF's."""
     samples = fields.shape[1]
     window = padded_shape((1, samples), (0, count), padding)[1]
@@ -195,7 +195,7 @@ class _Part(AbstractMask):
 
 
 @jax.jit(static_argnames="method")
-def _central(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+def _central(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     """The PSF of the middle of the mask on the middle of the sensor."""
     rows, columns = (min(_PART, n) for n in method.mask_shape or grid.shape)
     method = replace(method, mask_shape=(rows, columns))

@@ -63,18 +63,6 @@ class Selection(Prediction):
       errors are counted from.
     - `reasons`: one sentence for every effect left out, with its size.
     - `considered`: the predictions that the choice was made from, cheapest first.
-
-    ```python
-    import thincam_jax as tc
-    from thincam_jax.units import nm, um
-
-    mask = tc.FresnelZoneAperture(25.0, width=1.6)
-    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    choice = tc.choose_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
-    print(choice.meets_tolerance)  # True
-    ```
-
-    **See also**: `choose_model`.
     """
 
     meets_tolerance: bool
@@ -90,7 +78,7 @@ def choose_model(
     wavelength: Number,
     object_distance: Number = math.inf,
     tolerance: float,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Selection:
     r"""The cheapest model and precision whose PSF is within `tolerance` of the best one.
 
@@ -162,7 +150,7 @@ def predict_error(
     object_distance: Number = math.inf,
     at: Position | None = None,
     model: Model | PsfMethod,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments as for `psf`, reference as for
     `choose_model`.
@@ -208,7 +196,7 @@ def predict_cost(
     wavelength: Number,
     object_distance: Number = math.inf,
     model: Model | PsfMethod,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> tuple[Cost, float | None]:
     """Cost of a PSF before it is computed, and its predicted error; arguments as for `psf`.
 

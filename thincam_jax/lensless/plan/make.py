@@ -16,7 +16,7 @@ from thincam_jax.lensless.method import has_few_terms
 from thincam_jax.lensless.plan.choose import choose_planes, choose_psf, choose_wavelengths
 from thincam_jax.lensless.plan.effects import effects_of
 from thincam_jax.lensless.plan.field import choose_field, knows_field
-from thincam_jax.lensless.plan.run import Plan
+from thincam_jax.lensless.plan.run import CapturePlan
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
 
 # Parts of the tolerance that the decisions may use, in the order in which they are taken. What one
@@ -27,7 +27,7 @@ _MODEL_SHARE, _FIELD_SHARE, _WAVELENGTH_SHARE = 0.3, 0.3, 0.6
 @checked
 def plan_capture(
     camera: LenslessCamera, scene: Scene, *, tolerance: float, over_field: bool = True
-) -> Plan:
+) -> CapturePlan:
     r"""Plan the capture of a scene to a relative error at the least cost.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture, against every plane and wavelength
@@ -45,9 +45,9 @@ def plan_capture(
       convolved. Planes with nearly equal PSFs merge into one.
 
     With `over_field` False the capture is that of the axis' PSF and light, as solvers that are
-    given cameras assume it, and the error is against that; so it is for rings. `Plan.effects`
-    then lists what changes over the field, with its size, and always shot noise and what Fresnel's
-    approximation leaves out.
+    given cameras assume it, and the error is against that; so it is for rings. Then
+    `CapturePlan.effects` lists what changes over the field, with its size, and always shot noise
+    and what Fresnel's approximation leaves out.
 
     **Errors**: ValueError for a tolerance that is not positive; TypeError for traced numbers.
 
@@ -82,7 +82,7 @@ def plan_capture(
     shares = {"model": model_error, "field": field_error}
     shares |= {"wavelengths": colour_error, "planes": plane_error}
     window = fast_shape(kernel_shape(camera.sensor.shape, seen.field_shape), real=True)
-    return Plan(
+    return CapturePlan(
         camera=camera,
         tolerance=tolerance,
         predicted_error=sum(shares.values()),

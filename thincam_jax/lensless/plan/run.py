@@ -23,8 +23,8 @@ _NEAR = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Plan by which `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
+class CapturePlan:
+    """Plan by which `capture` computes a scene within a tolerance; by `plan_capture`.
 
     Print it for a table. It holds for scenes with the same planes and wavelengths as the one that
     it was made for and images like its, and for cameras within 1 % of its own, at any phase of the
@@ -45,19 +45,6 @@ class Plan:
     - `cost`, `full_cost`: cost of the plan, and of computing every plane and wavelength.
     - `shares`: predicted errors of the single decisions.
     - `effects`: effects that the capture holds and those that it leaves out.
-
-    ```python
-    import thincam_jax as tc
-    from thincam_jax.units import nm, um
-
-    mask = tc.FresnelZoneAperture(25.0, width=1.6)
-    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
-    planes = [tc.ImagePlane([[0.0, 1.0]], d, width=0.2 * d) for d in (200.0, 210.0)]
-    plan = tc.plan_capture(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
-    print(len(plan.distances))  # 1
-    ```
-
-    **See also**: `plan_capture`.
     """
 
     camera: LenslessCamera
@@ -122,7 +109,7 @@ class Plan:
         return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
 
 
-def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "*batch y x"]:
+def run_plan(plan: CapturePlan, camera: LenslessCamera, scene: Scene) -> Float[Array, "*batch y x"]:
     """The noise-free capture: planes mixed, convolved with the planned PSFs, and added up."""
     require_fits(plan, camera, scene)
     own = precision_of(camera.sensor.pitch)
@@ -146,7 +133,7 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
     return cast(total, own)
 
 
-def require_fits(plan: Plan, camera: LenslessCamera, scene: Scene) -> None:
+def require_fits(plan: CapturePlan, camera: LenslessCamera, scene: Scene) -> None:
     """ValueError where camera or scene are not the plan's. Traced numbers are not checked."""
     other = _other_numbers(plan.camera, camera)
     if other:

@@ -20,7 +20,7 @@ from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
 
 # Rings of frequencies, and frequencies in each.
@@ -143,11 +143,13 @@ class TransferProbe:
         method = replace(method, precision="float32")
         return self._transfer(self._single_waves, self._path(wavelength, distance, at), method)
 
-    def _path(self, wavelength: float, distance: float, at: tuple[float, float] | None) -> Path:
+    def _path(
+        self, wavelength: float, distance: float, at: tuple[float, float] | None
+    ) -> LightPath:
         path = self.camera.path(float(wavelength), float(distance), at)
         return path if at is None else replace(path, follows=True, skew=False)
 
-    def _transfer(self, waves_of, path: Path, method: PsfMethod) -> Complex[np.ndarray, " k"]:
+    def _transfer(self, waves_of, path: LightPath, method: PsfMethod) -> Complex[np.ndarray, " k"]:
         given = self.camera.mask, self.camera.sensor.pitch, path
         mask, pitch, path = cast(given, method.float_type)
         points = SparseGrid(self.places[0], self.places[1], pitch)
@@ -180,7 +182,7 @@ class SampledProbe:
 def _transfer(
     mask: AbstractMask,
     points: SparseGrid,
-    path: Path,
+    path: LightPath,
     down: Float[Array, "m k2"],
     across: Float[Array, "n k2"],
     method: PsfMethod,

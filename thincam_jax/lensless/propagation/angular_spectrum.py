@@ -10,7 +10,7 @@ from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_
 from thincam_jax._core.precision import as_complex, squared_modulus, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation.path import ChiefRay, Path
+from thincam_jax.lensless.propagation.path import ChiefRay, LightPath
 
 PADDING = 2.0  # the window of a PSF over mask and sensor side by side
 
@@ -29,7 +29,7 @@ class Sampling(eqx.Module):
 
 
 def angular_spectrum_sampling(
-    path: Path, frequency: Float[Array, ""], pitch: Float[Array, ""], count: int
+    path: LightPath, frequency: Float[Array, ""], pitch: Float[Array, ""], count: int
 ) -> Sampling:
     r"""Sampling condition of `propagate`: is a field of that local frequency carried right?
 
@@ -49,7 +49,7 @@ def angular_spectrum_sampling(
 
 
 def propagate(
-    field: Complex[Array, "y x"], pitch: Float[Array, ""], path: Path
+    field: Complex[Array, "y x"], pitch: Float[Array, ""], path: LightPath
 ) -> Complex[Array, "y x"]:
     r"""A field after the distance d of `path`, on the same (already padded) window.
 
@@ -72,7 +72,7 @@ def propagate(
 
 
 def propagate_along(
-    ray: ChiefRay, field: Complex[Array, "y x"], pitch: Float[Array, ""], path: Path
+    ray: ChiefRay, field: Complex[Array, "y x"], pitch: Float[Array, ""], path: LightPath
 ) -> Complex[Array, "y x"]:
     r"""`propagate` of a field whose carrier is a chief ray, left out before and behind.
 
@@ -115,7 +115,7 @@ def propagate_along(
 
 
 def angular_spectrum(
-    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod, *, padding: float = PADDING
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod, *, padding: float = PADDING
 ) -> Float[Array, "y x"]:
     r"""PSF of any mask by the band-limited angular spectrum; exact scalar diffraction when sampled.
 
@@ -151,14 +151,14 @@ def angular_spectrum(
     return irradiance[middle, middle]
 
 
-def lit_mask(mask: AbstractMask, plane: Grid, path: Path) -> Complex[Array, "y x"]:
+def lit_mask(mask: AbstractMask, plane: Grid, path: LightPath) -> Complex[Array, "y x"]:
     """Field just behind the mask under the exact spherical wave, 1 on the axis, piston dropped."""
     ray = path.chief_ray(mask.centre)
     lit = spherical_wave(plane, path) if ray is None else _inclined(ray, mask.centre, plane, path)
     return lit * mask.sample(plane, path.wavelength).astype(lit.dtype)
 
 
-def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
+def spherical_wave(plane: Grid, path: LightPath) -> Complex[Array, "y x"]:
     """The wave of the point at t in the mask's plane, 1 on the axis, piston dropped."""
     rho2 = plane.y[:, None] ** 2 + plane.x**2
     nearness = 1 / path.object_distance  # zero for a plane wave
@@ -169,7 +169,7 @@ def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
 
 
 def _inclined(
-    ray: ChiefRay, centre: Float[Array, "2"], plane: Grid, path: Path
+    ray: ChiefRay, centre: Float[Array, "2"], plane: Grid, path: LightPath
 ) -> Complex[Array, "y x"]:
     """Wave of a point off the axis: 1 at the mask's middle, without the chief ray's carrier."""
     y, x = plane.y[:, None] - centre[0], plane.x - centre[1]
@@ -182,7 +182,7 @@ def _inclined(
 
 
 def _in_window(
-    ray: ChiefRay, window: tuple[int, int], sensor: Grid, path: Path
+    ray: ChiefRay, window: tuple[int, int], sensor: Grid, path: LightPath
 ) -> Float[Array, "y x"]:
     """1 where the window that the ray carries to the sensor lies, else 0."""
     reach = [n * sensor.pitch / 2 for n in window]
@@ -191,7 +191,7 @@ def _in_window(
     return (y[:, None] & x).astype(sensor.pitch.dtype)
 
 
-def _from_samples(ray: ChiefRay, path: Path) -> Float[Array, "2"]:
+def _from_samples(ray: ChiefRay, path: LightPath) -> Float[Array, "2"]:
     """(y, x) from the middle of the sensor's samples to where the ray meets it, mm."""
     return path.distance * jnp.stack([ray.down, ray.across]) / ray.cosine - path.moved
 
@@ -237,6 +237,6 @@ def _frequencies(
     return v[:, None], u
 
 
-def _band_limit(path: Path, window: Float[Array, ""]) -> Float[Array, ""]:
+def _band_limit(path: LightPath, window: Float[Array, ""]) -> Float[Array, ""]:
     """Highest frequency whose phase turns by less than π between the window's frequencies."""
     return 1 / (path.wavelength * jnp.sqrt((2 * path.distance / window) ** 2 + 1))

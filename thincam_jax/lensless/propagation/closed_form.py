@@ -6,10 +6,10 @@ from jaxtyping import Array, Bool
 from thincam_jax._core.precision import as_complex
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum, gather_constants
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 
-def closed_form(mask: AbstractMask, path: Path) -> ChirpSum:
+def closed_form(mask: AbstractMask, path: LightPath) -> ChirpSum:
     r"""PSF of the unbounded mask, exact in the Fresnel approximation (thesis Eq 3.22, corrected).
 
     The order k becomes :math:`c_k (1+k\epsilon)^{-1} \exp\{j k\beta/(1+k\epsilon)\, r^2/M^2\}` with
@@ -37,7 +37,7 @@ def closed_form(mask: AbstractMask, path: Path) -> ChirpSum:
     return ChirpSum(amplitudes, curvatures / scale**2, scale * mask.centre)
 
 
-def in_focus(mask: AbstractMask, path: Path) -> Bool[Array, ""]:
+def in_focus(mask: AbstractMask, path: LightPath) -> Bool[Array, ""]:
     """Whether an order focuses on the sensor, 1 + kε = 0: the unbounded mask has no PSF there."""
     zones = require_zone_orders(mask, "closed_form")
     k = jnp.asarray(zones.orders, dtype=zones.beta.dtype)

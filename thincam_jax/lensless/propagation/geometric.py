@@ -13,12 +13,12 @@ from thincam_jax.lensless.masks.base import (
     other_models,
 )
 from thincam_jax.lensless.propagation.chirp import chirp_average
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
 
 def geometric(
-    mask: AbstractMask, grid: Grid, path: Path, *, pixel_integration: bool = False
+    mask: AbstractMask, grid: Grid, path: LightPath, *, pixel_integration: bool = True
 ) -> SeparableSum | Float[Array, "y x"]:
     r"""Shadow of the mask, magnified by M (thesis Eq 3.3, corrected): h(r) = |t(r/M)|².
 

@@ -10,14 +10,14 @@ from jaxtyping import Float
 from thincam_jax._core import checks
 from thincam_jax.lensless.masks.base import AbstractMask, other_models
 from thincam_jax.lensless.method import SAMPLED, AccuracyWarning, Model
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 # Relative L2 error of a zone plate's PSF for a radian of phase left out at the mask's edge.
 ERROR_PER_RADIAN = 0.22
 _LARGEST_ERROR = 0.05
 
 
-def require_off_axis(mask: AbstractMask, path: Path, model: Model) -> None:
+def require_off_axis(mask: AbstractMask, path: LightPath, model: Model) -> None:
     """ValueError for a model on the axis only; AccuracyWarning where the ray is too steep for it.
 
     Known numbers only: of traced ones, the model alone is looked at.

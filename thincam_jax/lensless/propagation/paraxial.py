@@ -6,10 +6,10 @@ from jaxtyping import Array, Float
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum, gather_constants
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 
-def paraxial(mask: AbstractMask, path: Path) -> ChirpSum:
+def paraxial(mask: AbstractMask, path: LightPath) -> ChirpSum:
     r"""PSF of the unbounded mask to first order in ε in the phase (thesis Eq 3.26, corrected).
 
     .. math::

@@ -17,7 +17,7 @@ from thincam_jax._core.quantity import quantity
 _positive_or_infinite = functools.partial(checks.positive, unit="mm", allow_infinity=True)
 
 
-class Path(Module):
+class LightPath(Module):
     r"""A point source at distance t before the mask, a sensor at d behind it.
 
     In the Fresnel approximation a spherical wave from t over d acts like a plane wave over d/M,
@@ -113,7 +113,7 @@ class Path(Module):
         cosine = 1 / jnp.sqrt(1 + jnp.sum(slopes**2))
         return ChiefRay(slopes[0] * cosine, slopes[1] * cosine, cosine)
 
-    def along_axes(self, centre: Float[Array, "2"]) -> tuple["Path", "Path"]:
+    def along_axes(self, centre: Float[Array, "2"]) -> tuple["LightPath", "LightPath"]:
         r"""The paths on the axis whose waves are those along y and along x, of the same M.
 
         Their distances are :math:`\tfrac dc(1 + s_i^2/c^2)`: the diagonal of B⁻¹. For a point on

@@ -17,7 +17,7 @@ from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod
 from thincam_jax.lensless.propagation.chirp import edge_wave
 from thincam_jax.lensless.propagation.lattice import pixel_mean
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 # From this v on the rim's waves are those of its nearest and its farthest point.
 _TWO_WAVES = 8.0
@@ -29,7 +29,9 @@ _NODES = np.stack(hermgauss(8), axis=-1)[4:]
 _PER_FRINGE, _STENCIL, PROFILE_ERROR = 14, range(-2, 4), 1e-6
 
 
-def radial(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> Float[Array, "y x"]:
+def radial(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> Float[Array, "y x"]:
     r"""PSF of rings, exact within the Fresnel approximation: |Σ_i (t_i − t_{i+1}) U_i(ρ)|².
 
     The field of a disc of radius a at ρ from its middle is an integral over its rim, at the
@@ -79,7 +81,9 @@ def radial(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> Flo
     return pixel_mean(at, nodes, jnp.zeros(grid.shape, x.dtype))
 
 
-def profile_samples(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> int | None:
+def profile_samples(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> int | None:
     """Samples a pixel, a power of two; None where the profile saves nothing or numbers are traced.
 
     The band of the irradiance ends at 2a/(λd), a the outer radius: so many fringes there are.
@@ -101,7 +105,7 @@ def profile_length(shape: tuple[int, int], oversampling: int) -> int:
     return math.ceil((math.hypot(*shape) + 2) * oversampling) + len(_STENCIL)
 
 
-def irradiance(mask: RadialMask, path: Path, rho: Float[Array, "*at"]) -> Float[Array, "*at"]:
+def irradiance(mask: RadialMask, path: LightPath, rho: Float[Array, "*at"]) -> Float[Array, "*at"]:
     """|U|² at the distances ρ from the middle, mm, on the mask's scale."""
 
     @jax.checkpoint

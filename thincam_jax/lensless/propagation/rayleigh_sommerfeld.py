@@ -9,14 +9,18 @@ from thincam_jax._core.precision import squared_modulus, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes, within
-from thincam_jax.lensless.propagation.path import ChiefRay, Path
+from thincam_jax.lensless.propagation.path import ChiefRay, LightPath
 
 # Sensor samples done together: bounds the memory to this many copies of the mask plane.
 _BATCH = 64
 
 
 def rayleigh_sommerfeld_field(
-    field: Complex[Array, "v u"], plane: Grid, sensor: Grid, path: Path, ray: ChiefRay | None = None
+    field: Complex[Array, "v u"],
+    plane: Grid,
+    sensor: Grid,
+    path: LightPath,
+    ray: ChiefRay | None = None,
 ) -> Complex[Array, "y x"]:
     r"""First Rayleigh-Sommerfeld integral as a midpoint sum over the samples of the mask plane.
 
@@ -61,7 +65,7 @@ def _behind_ray(ray: ChiefRay, d, y, x, distance):
 
 
 def rayleigh_sommerfeld(
-    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> Float[Array, "y x"]:
     """PSF of any mask by direct summation: the reference for tests and small grids.
 

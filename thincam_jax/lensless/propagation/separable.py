@@ -14,7 +14,7 @@ from thincam_jax._core.precision import Precision, as_complex, product
 from thincam_jax.lensless.masks.base import AbstractMask, AxisFactors, pairs, require_factored
 from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
 # Nodes fewer than `PIXEL_NODES`, and the fringes a pixel up to which their averages are exact to
@@ -32,7 +32,7 @@ _SMALL = 1024
 
 
 def pixel_nodes(
-    mask: AbstractMask, grid: Grid, path: Path, precision: Precision, tolerance: float = 0.0
+    mask: AbstractMask, grid: Grid, path: LightPath, precision: Precision, tolerance: float = 0.0
 ) -> int:
     """Nodes that the pixel average needs; `PIXEL_NODES` while the numbers are traced.
 
@@ -47,7 +47,7 @@ def pixel_nodes(
     return next(iter(few), _MORE[-1])
 
 
-def average_error(mask: AbstractMask, grid: Grid, path: Path, nodes: int) -> float:
+def average_error(mask: AbstractMask, grid: Grid, path: LightPath, nodes: int) -> float:
     """Relative error of the PSF, of nodes that do not follow the fringes; 0 of others."""
     known = _fringes(mask, grid, path)
     return 0.0 if known is None or _follow(nodes, known[0]) else known[1] / nodes
@@ -58,7 +58,7 @@ def _follow(nodes: int, fringes: float) -> bool:
     return fringes <= few or nodes >= fringes * math.pi / 2 + _BEYOND
 
 
-def _fringes(mask: AbstractMask, grid: Grid, path: Path) -> tuple[float, float] | None:
+def _fringes(mask: AbstractMask, grid: Grid, path: LightPath) -> tuple[float, float] | None:
     """Fringes a pixel and the error of one node; None while the numbers are traced.
 
     The band of the irradiance ends at width/(λd): so many fringes there are at most.
@@ -74,7 +74,7 @@ def _fringes(mask: AbstractMask, grid: Grid, path: Path) -> tuple[float, float] 
 
 @jax.jit
 def axis_fields(
-    factors: AxisFactors, path: Path, x: Float[Array, " n"]
+    factors: AxisFactors, path: LightPath, x: Float[Array, " n"]
 ) -> Complex[Array, "term n"]:
     r"""One-dimensional factor of every term's field, relative to the open aperture.
 
@@ -107,7 +107,7 @@ def axis_fields(
 
 
 def cell_shadows(
-    edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
+    edges: Float[Array, " edge"], path: LightPath, x: Float[Array, " n"]
 ) -> tuple[Complex[Array, "cell n"], Complex[Array, "edge n"]]:
     """Shadows of constant cells: where each is lit, and the wave of each edge (`edge_wave`)."""
     offset = -path.detour(x - edges[:, None])
@@ -118,9 +118,9 @@ def cell_shadows(
 def separable(
     mask: AbstractMask,
     grid: Grid,
-    path: Path,
+    path: LightPath,
     *,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
     nodes: int = PIXEL_NODES,
 ) -> SeparableSum:
     r"""PSF of a mask of separable terms: of a zone plate's orders, or of cells.

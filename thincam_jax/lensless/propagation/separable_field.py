@@ -9,12 +9,12 @@ from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import product
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, MaskTerms
 from thincam_jax.lensless.propagation.lattice import pixel_mean
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable import axis_fields, cell_shadows
 
 
 def separable_image(
-    mask: AbstractFactoredMask, grid: Grid, path: Path, *, nodes: int | None
+    mask: AbstractFactoredMask, grid: Grid, path: LightPath, *, nodes: int | None
 ) -> Float[Array, "y x"]:
     r"""PSF of a mask of K terms, |Σ_k c_k A_k(x) B_k(y)|² summed before it is squared.
 
@@ -56,7 +56,7 @@ def _cells(terms: MaskTerms) -> Complex[Array, "row column"]:
 
 
 def _cell_fields(
-    edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
+    edges: Float[Array, " edge"], path: LightPath, x: Float[Array, " n"]
 ) -> Complex[Array, "cell n"]:
     """Field of each open cell alone, along one axis; see `axis_fields`."""
     lit, waves = cell_shadows(edges, path, x)

@@ -25,7 +25,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex, phasor, product
 from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 
 class TransferFactors(eqx.Module):
@@ -46,7 +46,7 @@ class TransferFactors(eqx.Module):
 
 def transfer_factors(
     mask: AbstractMask,
-    path: Path,
+    path: LightPath,
     v: Float[Array, " v"],
     u: Float[Array, " u"],
     *,
@@ -78,7 +78,7 @@ def transfer_factors(
     return TransferFactors(weights[:, None] * rows, columns)
 
 
-def overlaps(zones: ZoneOrders, path: Path, u: Float[Array, " u"]) -> Complex[Array, "pair u"]:
+def overlaps(zones: ZoneOrders, path: LightPath, u: Float[Array, " u"]) -> Complex[Array, "pair u"]:
     """T_kl(u) of the pairs k ≤ l of orders, mm; 0 beyond the aperture's cut-off w/(λd)."""
     shift = path.wavelength * path.distance * u
     values = overlaps_of(zones.orders, zones.beta, zones.width, shift, path.magnification * u)

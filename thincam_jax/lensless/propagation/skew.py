@@ -15,7 +15,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product, squared_modulus
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 
 # What the axes may share of an order's curvature, 1 where it focuses along a line.
 _MOST_SHARED = 0.25
@@ -29,7 +29,7 @@ _NODES, _FEW_NODES = 32, 16
 _AT_ONCE = 2**19
 
 
-def focuses_on_a_line(mask: AbstractMask, path: Path) -> bool:
+def focuses_on_a_line(mask: AbstractMask, path: LightPath) -> bool:
     """Whether `skew_image` refuses a point off both axes; False where that is not known yet."""
     if checks.holds_traced(mask, path):
         return False
@@ -38,7 +38,7 @@ def focuses_on_a_line(mask: AbstractMask, path: Path) -> bool:
         return zones is not None and bool(_shared(*_curvatures(zones, ray, path)) > _MOST_SHARED)
 
 
-def _curvatures(zones, ray, path: Path):
+def _curvatures(zones, ray, path: LightPath):
     """Entries (yy, xx, yx) of the matrix B, and kβ of the orders."""
     b = path.fresnel_curvature * ray.cosine
     matrix = (1 - ray.down**2) * b, (1 - ray.across**2) * b, -ray.down * ray.across * b
@@ -51,7 +51,7 @@ def _shared(matrix, curvatures) -> Float[Array, ""]:
     return jnp.max(jnp.abs(shared))
 
 
-def corner_error(mask: AbstractMask, path: Path, pixel: float) -> float:
+def corner_error(mask: AbstractMask, path: LightPath, pixel: float) -> float:
     r"""Relative error of `skew_image`, about at most, by the waves of the mask's corners.
 
     They have another phase beyond a distance of :math:`l = z\sigma^{-1/4}` from both edges, with
@@ -68,11 +68,11 @@ def corner_error(mask: AbstractMask, path: Path, pixel: float) -> float:
 
 
 def skew_image(
-    mask: AbstractMask, grid: Grid, path: Path, *, nodes: int | None
+    mask: AbstractMask, grid: Grid, path: LightPath, *, nodes: int | None
 ) -> Float[Array, "y x"]:
     r"""PSF of a zone plate for a point off both axes, |Σ_k c_k U_k|².
 
-    With the matrix B of `Path` and A_k = kβ I + B, the order k of the unbounded plate is
+    With the matrix B of `LightPath` and A_k = kβ I + B, the order k of the unbounded plate is
 
     .. math::
         \sqrt{\frac{\det B}{\det A_k}}\; e^{j k\beta\,\mathbf u^T A_k^{-1} B\,\mathbf u},

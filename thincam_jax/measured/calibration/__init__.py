@@ -1,8 +1,7 @@
 """Calibration from captures: PSF fits, registration, stripes, Hadamard patterns, screens."""
 
 from thincam_jax._core.names import modules_of
-from thincam_jax.measured.calibration.captures import create_captures as create_captures
-from thincam_jax.measured.calibration.captures import open_captures as open_captures
+from thincam_jax.measured.calibration.captures import HadamardCaptures as HadamardCaptures
 from thincam_jax.measured.calibration.captures import simulate_captures as simulate_captures
 from thincam_jax.measured.calibration.hadamard import HadamardSeries as HadamardSeries
 from thincam_jax.measured.calibration.registration import (

@@ -132,13 +132,13 @@ class Alignment:
         shown = skimage.transform.warp(levels / 255, inverse, output_shape=fine, order=0)
         return np.rint(255 * block_mean(shown, _PARTS)).astype(np.uint8)
 
-    def write(self, path: str | PathLike[str]) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write a JSON file."""
         arrays = {name: getattr(self, name).tolist() for name in ("unknowns", "covariance")}
         write_whole(path, json.dumps(asdict(self) | arrays, indent=1) + "\n")
 
     @classmethod
-    def read(cls, path: str | PathLike[str]) -> "Alignment":
+    def load(cls, path: str | PathLike[str]) -> "Alignment":
         """Read such a file; ValueError, one line, for another one."""
         try:
             given = read_json(path)

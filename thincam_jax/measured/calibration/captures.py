@@ -33,13 +33,14 @@ from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 @dataclasses.dataclass(frozen=True)
 class HadamardCaptures:
-    """A complete set of captures, as opened by `open_captures`.
+    """A complete set of captures on disk.
 
     - `series`: the patterns shown.
     - `sensor_shape`: (rows, columns).
     - `bits`: bits of the camera; None: any numbers.
     - `exposure`: time, s, if known.
     - `stored_at`: place in the store of each frame of the series; None: the same order.
+    - `frames`: kept in memory, in place of the store at `path`.
     """
 
     path: Path
@@ -48,14 +49,93 @@ class HadamardCaptures:
     bits: int | None
     exposure: float | None
     stored_at: tuple[int, ...] | None = None
+    frames: Real[np.ndarray, "frame y x"] | None = dataclasses.field(default=None, compare=False)
+
+    @staticmethod
+    def create(
+        path: str | Path,
+        series: HadamardSeries,
+        sensor_shape: Shape,
+        *,
+        bits: int | None = None,
+        exposure: float | None = None,
+    ) -> "CaptureWriter":
+        """Create a store for the captures of a calibration.
+
+        - `bits`: bits of the camera, up to 16, for whole counts; None: any numbers, in float32.
+        - `exposure`: time, s, for the record.
+
+        **Errors**: CaptureStoreError where something is at `path` already.
+        """
+        path, shape = Path(path), checks.shape2d("sensor_shape", sensor_shape)
+        if bits is not None and not 1 <= bits <= 16:
+            raise ValueError(f"bits = {bits}; give 1 to 16, or None for any numbers")
+        if path.exists():
+            known = "give another name, or go on by HadamardCaptures.resume"
+            raise CaptureStoreError(f"{path} exists; {known}")
+        CaptureStore.create(
+            path,
+            (series.frame_count, *shape),
+            dtype_of_bits(bits),
+            {
+                "kind": CALIBRATION,
+                **dataclasses.asdict(series),
+                "sensor_shape": shape,
+                "bits": bits,
+                "exposure": exposure,
+            },
+        )
+        return CaptureWriter(path)
+
+    @staticmethod
+    def resume(path: str | Path) -> "CaptureWriter":
+        """Continue an incomplete store with its `missing` frames."""
+        return CaptureWriter(Path(path))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "HadamardCaptures":
+        """Open the complete captures of a calibration.
+
+        **Errors**: CaptureStoreError, one line, which names the frames that are missing, truncated
+        or identical. Damage within a chunk is detected by its checksum when it is read.
+        """
+        path = Path(path)
+        store = _opened(path)
+        captures, digests = _described(store), store.digests
+        lost, cut = store.lost(), store.lost(truncated=True)
+        missing = sorted(set(np.flatnonzero(digests == 0).tolist()) | (lost - cut))
+        if missing:
+            raise CaptureStoreError(
+                f"{path}: {len(missing)} of {len(digests)} frames are missing: {listed(missing)}; "
+                "capture them (HadamardCaptures.resume, or the same acquisition again)"
+            )
+        if cut:
+            raise CaptureStoreError(
+                f"{path}: {len(cut)} of {len(digests)} frames are truncated: {listed(sorted(cut))}"
+                "; capture them (HadamardCaptures.resume, or the same acquisition) or copy it again"
+            )
+        if captures.stored_at is not None:
+            digests = digests[list(captures.stored_at)]
+        shown = digests[: captures.series.pattern_frames]
+        _, first, counts = np.unique(shown, return_index=True, return_counts=True)
+        for index in np.sort(first[counts > 1])[:1]:
+            same = np.flatnonzero(shown == shown[index]).tolist()
+            raise CaptureStoreError(
+                f"{path}: frames {listed(same)} are the same capture, digit for digit: the camera "
+                "has sent an image twice, or sees nothing of the monitor; measure again"
+            )
+        return captures
 
     @property
     def block_rows(self) -> int:
         """Sensor rows of a chunk, best read at once."""
-        return _opened(self.path).frames.chunks[1]
+        in_memory = self.frames is not None
+        return self.sensor_shape[0] if in_memory else _opened(self.path).frames.chunks[1]
 
     def rows(self, start: int, stop: int) -> Real[np.ndarray, "frame y x"]:
         """All frames of some sensor rows, in the order of the series."""
+        if self.frames is not None:
+            return self.frames[:, start:stop]
         frames = _opened(self.path).read(slice(None), slice(start, stop))
         return frames if self.stored_at is None else frames[list(self.stored_at)]
 
@@ -143,98 +223,29 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         return pixels.astype(self._store.frames.dtype)
 
 
-def create_captures(
-    path: str | Path,
-    series: HadamardSeries,
-    sensor_shape: Shape,
-    *,
-    bits: int | None = None,
-    exposure: float | None = None,
-) -> CaptureWriter:
-    """Create a store for the captures of a calibration.
-
-    - `bits`: bits of the camera, up to 16, for whole counts; None: any numbers, in float32.
-    - `exposure`: time, s, for the record.
-
-    **Errors**: CaptureStoreError where something is at `path` already.
-    """
-    path, shape = Path(path), checks.shape2d("sensor_shape", sensor_shape)
-    if bits is not None and not 1 <= bits <= 16:
-        raise ValueError(f"bits = {bits}; give 1 to 16, or None for any numbers")
-    if path.exists():
-        raise CaptureStoreError(f"{path} exists; give another name, or resume_captures to go on")
-    CaptureStore.create(
-        path,
-        (series.frame_count, *shape),
-        dtype_of_bits(bits),
-        {
-            "kind": CALIBRATION,
-            **dataclasses.asdict(series),
-            "sensor_shape": shape,
-            "bits": bits,
-            "exposure": exposure,
-        },
-    )
-    return CaptureWriter(path)
-
-
-def resume_captures(path: str | Path) -> CaptureWriter:
-    """Continue an incomplete store with its `missing` frames."""
-    return CaptureWriter(Path(path))
-
-
-def open_captures(path: str | Path) -> HadamardCaptures:
-    """Open the complete captures of a calibration.
-
-    **Errors**: CaptureStoreError, one line, which names the frames that are missing, truncated or
-    identical. Damage within a chunk is detected by its checksum when it is read.
-    """
-    path = Path(path)
-    store = _opened(path)
-    captures, digests = _described(store), store.digests
-    lost, cut = store.lost(), store.lost(truncated=True)
-    missing = sorted(set(np.flatnonzero(digests == 0).tolist()) | (lost - cut))
-    if missing:
-        raise CaptureStoreError(
-            f"{path}: {len(missing)} of {len(digests)} frames are missing: {listed(missing)}; "
-            "capture them (resume_captures, or the same acquisition again)"
-        )
-    if cut:
-        raise CaptureStoreError(
-            f"{path}: {len(cut)} of {len(digests)} frames are truncated: {listed(sorted(cut))}; "
-            "capture them again (resume_captures, or the same acquisition) or copy the store again"
-        )
-    if captures.stored_at is not None:
-        digests = digests[list(captures.stored_at)]
-    shown = digests[: captures.series.pattern_frames]
-    _, first, counts = np.unique(shown, return_index=True, return_counts=True)
-    for index in np.sort(first[counts > 1])[:1]:
-        same = np.flatnonzero(shown == shown[index]).tolist()
-        raise CaptureStoreError(
-            f"{path}: frames {listed(same)} are the same capture, digit for digit: the camera has "
-            "sent an image twice, or sees nothing of the monitor; measure again"
-        )
-    return captures
-
-
 def simulate_captures(
-    writer: CaptureWriter,
+    writer: CaptureWriter | HadamardSeries,
     operator: AbstractOperator,
     key: Key,
     *,
     deviation: float = 0.0,
     offset: float = 0.0,
 ) -> HadamardCaptures:
-    """Simulate the captures of a known camera and write them to a store.
+    """Simulate the captures of a known camera and write them to a store, or keep them in memory.
 
+    - `writer`: by `create_captures`; or the series alone, whose frames stay in memory.
     - `operator`: from the cells, 1 is white, to the sensor, in counts (`Scaled` sets the exposure).
     - `deviation`: standard deviation of white noise, and `offset`: the dark level, in counts. For a
       writer with `bits` the counts are rounded and clipped.
 
     **Errors**: ValueError where the operator's shapes are not those of the cells and the sensor.
     """
-    key = random_key(key)
-    captures = writer.captures
+    key, kept = random_key(key), []
+    if isinstance(writer, HadamardSeries):
+        sensor = checks.shape2d("out_shape", operator.out_shape)
+        store, captures = None, HadamardCaptures(Path(), writer, sensor, None, None)
+    else:
+        store, captures = writer, writer.captures
     series, shape = captures.series, captures.sensor_shape
     given, wanted = (operator.in_shape, operator.out_shape), (series.object_shape, shape)
     if given != wanted:
@@ -248,9 +259,11 @@ def simulate_captures(
         if captures.bits is not None:
             images = np.clip(np.rint(images), 0, 2**captures.bits - 1)
         for number, image in zip(numbers, images, strict=True):
-            writer.write(number, image)
-    writer.close()
-    return open_captures(captures.path)
+            store.write(number, image) if store else kept.append(image)
+    if store is None:
+        return dataclasses.replace(captures, frames=np.stack(kept))
+    store.close()
+    return HadamardCaptures.load(captures.path)
 
 
 def _opened(path: Path, mode: str = "r") -> CaptureStore:

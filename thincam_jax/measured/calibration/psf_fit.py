@@ -18,7 +18,7 @@ from thincam_jax._core.precision import Precision, allow, cast, precision_of
 from thincam_jax._core.quantity import quantities, unchecked
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.measured.calibration.coarse import (
     covariance_by_differences,
     full_image,
@@ -57,7 +57,7 @@ _KNOWN, _KNOWN_BY_PARTS, _DISAGREE = 0.03, 0.005, 1.5
 
 
 # Of what can be fitted; of a centre, (y, x) are two numbers.
-_QUANTITIES = quantities(FresnelZoneAperture, LenslessCamera, Path)
+_QUANTITIES = quantities(FresnelZoneAperture, LenslessCamera, LightPath)
 _QUANTITIES |= dict.fromkeys(("centre_x", "centre_y"), _QUANTITIES["centre"])
 
 

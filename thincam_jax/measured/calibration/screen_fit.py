@@ -58,8 +58,8 @@ _PLACES = {
     "film_thickness": ("camera.screen.hologram.thickness", ...),
     "index_modulation": ("camera.screen.hologram.index_modulation", ...),
     "object_distance": ("plane.distance", ...),
-    "object_x": ("plane.centre", 0),
-    "object_y": ("plane.centre", 1),
+    "object_x": ("plane.centre", 1),
+    "object_y": ("plane.centre", 0),
     "gain": ("gain", ...),
 }
 _FIELDS = quantities(VolumeHologram, Screen, SeeThroughCamera, ObjectPlane)
@@ -80,8 +80,8 @@ _UNEXPLAINED = 5.0  # standard deviations of χ² of positions, at most
 class GhostPositions(eqx.Module):
     """Object points seen by pixels: a dot on a monitor, and the pixels lit by its ghosts.
 
-    - `pixels`: (x, y) on the sensor, mm from its middle, (ghost, 2).
-    - `points`: points of the object, (x, y) mm from its middle, (ghost, 2).
+    - `pixels`: (y, x) on the sensor, mm from its middle, (ghost, 2).
+    - `points`: points of the object, (y, x) mm from its middle, (ghost, 2).
     - `orders`: order of each ghost; 0 is the image.
     - `deviation`: standard deviation of the points, mm.
     """
@@ -130,7 +130,9 @@ class ScreenFit(Module):
 
     def system(self, plane: ObjectPlane) -> Scaled:
         """Matrix for an object at another distance, in the unit of the measured one."""
-        return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
+        return Scaled(
+            system_operator(self.camera, plane, orders=self.orders, samples=self.samples), self.gain
+        )
 
 
 class _State(eqx.Module):
@@ -237,8 +239,8 @@ def fit_screen(
     measured: Matrix | GhostPositions,
     camera: SeeThroughCamera,
     plane: ObjectPlane,
-    parameters: Sequence[str] = DEFAULT,
     *,
+    parameters: Sequence[str] = DEFAULT,
     orders: int = 4,
     samples: int | None = 4,
 ) -> ScreenFit:
@@ -365,8 +367,8 @@ def _smear(problem: _Problem, samples: int | None) -> _Smear:
         return _no_smear()
     camera, distance = problem.start.camera, problem.start.plane.distance
     band = trace_band(camera, problem.pixels, distance, problem.count, samples)
-    rays = trace(camera, problem.pixels, distance, problem.count)
-    away = band.points - rays.points[..., None, :2]
+    rays = trace(camera, problem.pixels, object_distance=distance, orders=problem.count)
+    away = band.points - rays.points[..., None, 1::-1]
     mean = jnp.sum(rays.weight) / jnp.sum(band.weight)
     offsets = jnp.where(band.weight[..., None, None] > 0, away, 0)
     return _Smear(offsets, mean * band.weight, rays.weight)
@@ -413,15 +415,15 @@ def _jacobian(problem: _Problem):
 def _model(state: _State, problem: _Problem):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
     camera, plane = state.camera, state.plane
-    rays = trace(camera, problem.pixels, plane.distance, problem.count)
+    rays = trace(camera, problem.pixels, object_distance=plane.distance, orders=problem.count)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
-        centroid = rays.points[..., :2] + jnp.mean(problem.smear.offsets, axis=2)
+        centroid = rays.points[..., 1::-1] + jnp.mean(problem.smear.offsets, axis=2)
         return centroid[problem.orders, place] - plane.centre
     size = seen_size(camera, plane)
     offsets = problem.smear.offsets
-    points = rays.points[..., None, :2] + offsets
-    down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0))
+    points = rays.points[..., None, 1::-1] + offsets
+    down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (0, 1))
     weight = state.gain * problem.smear.weight(rays.weight) / problem.full / offsets.shape[2]
     return jnp.einsum("op,opsy,opsx->pyx", weight, down, across, precision="highest")
 
@@ -431,7 +433,7 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
 
     The second difference of F(u) = ∫ Φ(v/σ) dv with the normal distribution Φ, max(u, 0) for σ = 0.
     """
-    number = plane.shape[1 - axis]
+    number = plane.shape[axis]
     low = (points - size / 2 - plane.centre[axis]) / plane.pitch + number / 2
     edges = jnp.arange(number + 1, dtype=low.dtype)
     wide = jnp.where(blur > 0, blur, 1.0)
@@ -447,7 +449,7 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
 
 def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
     """Mean total weight of a pixel's ghosts, which is 1 in `system_operator`."""
-    rays = trace(camera, pixels, plane.distance, orders)
+    rays = trace(camera, pixels, object_distance=plane.distance, orders=orders)
     return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 

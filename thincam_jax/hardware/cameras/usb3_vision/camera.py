@@ -11,10 +11,10 @@ import usb.util
 from thincam_jax.hardware.base import CameraSettings, Connected, Frame, Identity
 from thincam_jax.hardware.cameras.features import FeatureCamera, read, trigger_by_software
 from thincam_jax.hardware.cameras.usb3_vision import gencp
-from thincam_jax.hardware.cameras.usb3_vision.features import Features, fetch_xml
+from thincam_jax.hardware.cameras.usb3_vision.features import GenApiFeatures, fetch_xml
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
-from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink, cameras_there
-from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS, Stream, unpack
+from thincam_jax.hardware.cameras.usb3_vision.link import CameraMemory, UsbLink, cameras_there
+from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS, FrameReader, unpack
 from thincam_jax.hardware.errors import HardwareError, Timeout
 
 # Frames without chunk data, at any trigger.
@@ -72,15 +72,15 @@ class Usb3VisionCamera(FeatureCamera):
             raise
 
     def __init__(self, link: UsbLink, compare_clocks: bool):
-        self._link, control = link, Control(link)
+        self._link, control = link, CameraMemory(link)
         self._control = control
         registers = Abrm.MANUFACTURER, Abrm.MODEL, Abrm.SERIAL, Abrm.DEVICE_VERSION
         texts = (gencp.text(control.read(register, gencp.TEXT_LENGTH)) for register in registers)
         self.identity = Identity(*texts)
         self._name = link.name = str(self.identity)
         self._compare_clocks = compare_clocks and control.has_clock
-        self._features = Features(link, control, fetch_xml(link, control))
-        self._stream = Stream(link, control, control.sirm)
+        self._features = GenApiFeatures(link, control, fetch_xml(link, control))
+        self._stream = FrameReader(link, control, control.sirm)
         self._last_block, self._frames_before = -1, 0
         self._in_step = False
         self._stop()

@@ -20,7 +20,7 @@ from thincam_jax._core.text import shortened
 from thincam_jax.hardware.cameras.features import Number, Value
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
-from thincam_jax.hardware.cameras.usb3_vision.link import LARGEST_READ, Control, UsbLink
+from thincam_jax.hardware.cameras.usb3_vision.link import LARGEST_READ, CameraMemory, UsbLink
 
 LARGEST_XML = LARGEST_READ  # bytes; those of cameras have up to 2 MiB
 MOST_ENTRIES = 64
@@ -33,7 +33,7 @@ NO_NODES = ("EnumEntry", "pVariable", "Constant", "Expression")
 MOST_REFERENCES = {"p": 500_000, "pSelected": 20_000}
 
 
-def fetch_xml(link: UsbLink, control: Control) -> str:
+def fetch_xml(link: UsbLink, control: CameraMemory) -> str:
     """Read and check the XML that the camera's manifest table names."""
     table = control.read_number(Abrm.MANIFEST, 8)
     entries = control.read_number(table, 8)
@@ -126,7 +126,7 @@ def _kind(node: Any) -> str:
 class _Port(genapi.AbstractPort):
     """Access of the feature tree to the camera's registers."""
 
-    def __init__(self, control: Control):
+    def __init__(self, control: CameraMemory):
         super().__init__()
         self._control = control
 
@@ -140,10 +140,10 @@ class _Port(genapi.AbstractPort):
         self._control.write(address, bytes(buffer))
 
 
-class Features:
-    """`Features` of `cameras.features`, by GenApi."""
+class GenApiFeatures:
+    """`GenApiFeatures` of `cameras.features`, by GenApi."""
 
-    def __init__(self, link: UsbLink, control: Control, xml: str):
+    def __init__(self, link: UsbLink, control: CameraMemory, xml: str):
         self._link = link
         self._nodes, self._port = genapi.NodeMap(), _Port(control)
         with self.evaluating("read the XML"):

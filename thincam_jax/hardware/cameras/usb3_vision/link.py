@@ -182,7 +182,7 @@ class UsbLink:
             usb.util.dispose_resources(self._device)
 
 
-class Control:
+class CameraMemory:
     """Read and write the camera's memory with GenCP."""
 
     def __init__(self, link: UsbLink):

@@ -1,7 +1,7 @@
 """A USB3 Vision stream: leader, payload and trailer of each frame.
 
 Functions without a device decode the data and raise `ValueError` for violations of the standard;
-`Stream` reads frames with them. Numbers are little-endian:
+`FrameReader` reads frames with them. Numbers are little-endian:
 
     leader   u32 "U3VL"  u16 0  u16 size  u64 block id
              u16 0  u16 payload type  u64 timestamp (ns)  u32 pixel format
@@ -18,7 +18,7 @@ import numpy as np
 
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.cameras.usb3_vision.gencp import SIRM_LENGTH, Sirm
-from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink
+from thincam_jax.hardware.cameras.usb3_vision.link import CameraMemory, UsbLink
 from thincam_jax.hardware.errors import IncompleteFrame, Timeout
 
 LEADER = struct.Struct("<IHHQHHQIIIIIHH")
@@ -150,13 +150,13 @@ def plan_transfers(registers: bytes, expected: int) -> Transfers:
     )
 
 
-class Stream:
+class FrameReader:
     """Reader of whole frames: `prepare` after each configuration, `start` before, `stop` after.
 
     `prepare` allocates buffers for all frames; each frame is copied once, into its own array.
     """
 
-    def __init__(self, link: UsbLink, control: Control, sirm: int):
+    def __init__(self, link: UsbLink, control: CameraMemory, sirm: int):
         self._link, self._control, self._sirm = link, control, sirm
 
     def prepare(self, pixel_format: str, region: Region) -> None:
