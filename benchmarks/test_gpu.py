@@ -16,7 +16,7 @@ import skimage.data
 import thincam_jax as tc
 from benchmarks import test_public
 from thincam_jax.learn.denoiser.crops import Crops
-from thincam_jax.learn.denoiser.network import load_network
+from thincam_jax.learn.denoiser.network import Denoiser
 from thincam_jax.learn.denoiser.train import loss
 from thincam_jax.units import nm, um
 
@@ -126,7 +126,7 @@ def plug_and_play():
 
 def training_step():
     """Loss of the shipped denoiser and its gradient, 16 crops of 64²."""
-    network, random = load_network("shipped"), np.random.default_rng(0)
+    network, random = Denoiser.load("shipped").network, np.random.default_rng(0)
     clean = jnp.asarray(random.uniform(size=(16, 64, 64)), jnp.float32)
     sigma = jnp.full(16, 0.1, jnp.float32)
     noisy = clean + 0.1 * jnp.asarray(random.normal(size=clean.shape), jnp.float32)

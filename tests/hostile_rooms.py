@@ -64,7 +64,7 @@ def at_once(function: Callable[..., Any], *names: str, **fixed: Any) -> Callable
 
 
 def denoised(network: Any, image: Any, sigma: Any) -> Any:
-    return learn.Denoiser(network)(image, sigma)
+    return learn.Denoiser.load(network)(image, sigma)
 
 
 EXPOSURES = call(tc.Exposures, beta=[25.0, 13.0], distance=6.5, wavelength=WAVE, width=5.0)
@@ -205,7 +205,7 @@ LEARNED = (
         planes=3,
         pupil=1.0,
     ),
-    call(learn.load, path="nothing", cameras=camera()),
+    call(learn.RefocusNetwork.load, path="nothing", cameras=camera()),
     call(denoised, network="shipped", image=IMAGE, sigma=0.1),
     call(tc.PlugAndPlay, denoiser="shipped", strength=1.0, iterations=2, tolerance=1e-3),
 )

@@ -396,7 +396,7 @@ def picture(methods: Methods) -> None:
 if __name__ == "__main__":
     path, images, tuned, *more = sys.argv[1:]
     camera = refocus_camera()
-    network = learn.load(path, camera)
+    network = learn.RefocusNetwork.load(path, camera)
     side = 5 * max(camera.field_shape) // 4
     pictures, known = (squares(folder, camera, side) for folder in (images, tuned))
     table(network, pictures, known, int(more[0]) if more else 12)

@@ -14,9 +14,8 @@ from score_refocusing import refocus_camera
 
 from thincam_jax import learn
 from thincam_jax.learn.checkpoint import read_description
-from thincam_jax.learn.denoiser.network import load_network, network_description, save_network
+from thincam_jax.learn.denoiser.network import network_description
 from thincam_jax.learn.refocusing import store
-from thincam_jax.learn.refocusing.store import save
 
 ROOM = Path(__file__).parents[2] / "thincam_jax/learn"
 
@@ -28,10 +27,11 @@ def halved(weights):
 (path,) = sys.argv[1:]
 if read_description(path)["kind"] == "refocusing network":
     place = ROOM / "refocusing/shipped.thincam"
-    network = learn.load(path, refocus_camera())
+    network = learn.RefocusNetwork.load(path, refocus_camera())
     half = eqx.tree_at(lambda n: n.weights, network, halved(network.weights))
-    save(place, half, store.network_description(path)["training"])
+    half.save(place, store.network_description(path)["training"])
 else:
     place = ROOM / "denoiser/shipped.thincam"
-    save_network(place, halved(load_network(path)), network_description(path)["training"])
+    half = learn.Denoiser(halved(learn.Denoiser.load(path).network))
+    half.save(place, network_description(path)["training"])
 print(f"{place}: {place.stat().st_size / 1e6:.1f} MB")

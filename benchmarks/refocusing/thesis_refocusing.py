@@ -111,7 +111,7 @@ def main(images: str, tuned: str, count: int) -> None:
         tune(methods, known, min(count, 6), distances)
         runs = {"Wiener": methods.wiener, "ADMM-TV": methods.admm}
         if camera is here:
-            runs["network"] = Methods(learn.load("shipped", camera)).learned
+            runs["network"] = Methods(learn.RefocusNetwork.load("shipped", camera)).learned
         # The thesis' captures have no noise; the network is trained for 45 dB at most.
         for snr in (SNR, 45.0 if camera is here else 60.0):
             table(camera, runs, pictures, count, distances, snr)

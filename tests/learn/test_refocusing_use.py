@@ -21,13 +21,7 @@ from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.sources import as_json, drawn
-from thincam_jax.learn.refocusing.store import (
-    _SHIPPED_FILE,
-    SHIPPED,
-    load,
-    network_description,
-    save,
-)
+from thincam_jax.learn.refocusing.store import SHIPPED, SHIPPED_FILE, network_description
 from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
 from thincam_jax.learn.refocusing.use import Learned, doubt
 from thincam_jax.learn.training import TrainingOptions
@@ -38,7 +32,7 @@ from thincam_jax.units import nm, um
 def file(tmp_path_factory):
     """An untrained network in a file."""
     path = tmp_path_factory.mktemp("network") / NETWORK
-    return save(path, tiny.network(), {"images": as_json(tiny.lessons().images)})
+    return tiny.network().save(path, {"images": as_json(tiny.lessons().images)})
 
 
 @pytest.mark.thorough
@@ -48,7 +42,7 @@ def test_a_network_comes_back_for_its_camera(file):
     # Whatever its sensor makes of the light; as all it was trained for; or with its light.
     seen = tc.Cameras([tiny.camera()], wavelength=500 * nm, object_distance=80.0)
     for given in (tiny.camera(exposure=0.5), tiny.network().camera, seen):
-        found = load(file, given)
+        found = RefocusNetwork.load(file, given)
         assert eqx.tree_equal(found.weights, tiny.network().weights)
     assert eqx.tree_equal(found.planes.operator, tiny.network().planes.operator)
 
@@ -64,7 +58,7 @@ def test_training_goes_on_to_the_same_bits(tmp_path):
     assert eqx.tree_equal(resumed.state, whole.state)
     assert not eqx.tree_equal(whole.model.weights, tiny.network().weights)
     assert eqx.tree_equal(whole.model.planes, tiny.network().planes)
-    found = load(tmp_path / NETWORK, tiny.camera())
+    found = RefocusNetwork.load(tmp_path / NETWORK, tiny.camera())
     assert eqx.tree_equal(found.weights, whole.model.weights)
     told = network_description(tmp_path / NETWORK)["training"]
     assert told["steps"] == 4 and len(told["scores"]) == 2
@@ -74,37 +68,37 @@ def test_training_goes_on_to_the_same_bits(tmp_path):
     with pytest.raises(CheckpointError, match=r"whose training\.rate was 0\.003 and is 1\.0 here"):
         train(tiny.network(), tiny.lessons(), other, folder=tmp_path)
     with pytest.raises(CheckpointError, match="holds no refocusing network"):
-        load(tmp_path / STATE.format(1), tiny.camera())
+        RefocusNetwork.load(tmp_path / STATE.format(1), tiny.camera())
 
 
 @pytest.mark.thorough
 def test_another_camera_is_refused_with_both_numbers(file):
     with pytest.raises(CheckpointError, match=r"camera\.mask\.beta was 13\.0 and is 13\.1 here"):
-        load(file, tiny.camera(beta=13.1))
+        RefocusNetwork.load(file, tiny.camera(beta=13.1))
     seen = tc.Cameras([tiny.camera()], wavelength=600 * nm)
     with pytest.raises(CheckpointError, match=r"wavelengths\.0 was 0\.0005 and is 0\.0006 here"):
-        load(file, seen)
+        RefocusNetwork.load(file, seen)
     with pytest.raises(CheckpointError, match="takes one capture, not 2"):
-        load(file, tc.Cameras([tiny.camera()] * 2))
+        RefocusNetwork.load(file, tc.Cameras([tiny.camera()] * 2))
 
 
 def test_a_file_that_holds_something_else_is_told(file, tmp_path):
     other = write_arrays(tmp_path / "other", tiny.network().weights, {"kind": "something else"})
     with pytest.raises(CheckpointError, match="holds no refocusing network"):
-        load(other, tiny.camera())
-    save(other, tiny.network())
+        RefocusNetwork.load(other, tiny.camera())
+    tiny.network().save(other)
     known = network_description(other)
     known["camera"].pop("light")
     write_arrays(other, tiny.network().weights, known)
     with pytest.raises(CheckpointError, match="tells no whole camera"):
-        load(other, tiny.camera())
+        RefocusNetwork.load(other, tiny.camera())
     known = network_description(file)
     plain = known["options"]
     for wrong in ({"wings": 2}, {"widths": []}, {"widths": [0]}, {"widths": [4] * 5000}):
         known["options"] = {**plain, **wrong}
         write_arrays(other, tiny.network().weights, known)
         with pytest.raises(CheckpointError, match="options of another version") as told:
-            load(other, tiny.camera())
+            RefocusNetwork.load(other, tiny.camera())
         assert len(str(told.value)) < 500
 
 
@@ -173,17 +167,17 @@ def test_a_short_training_beats_the_linear_start():
 
 def test_what_is_shipped_may_be_given_on():
     """No photograph of a licence that binds those who use the weights, and few bytes."""
-    told = network_description(_SHIPPED_FILE)["training"]["images"]
+    told = network_description(SHIPPED_FILE)["training"]["images"]
     licences = {entry["licence"] for entries in told.values() for entry in entries}
     assert licences == {"scikit-image's own (its data folder's README)", "drawn", "CC0 1.0"}
-    assert _SHIPPED_FILE.stat().st_size < 4e6
+    assert SHIPPED_FILE.stat().st_size < 4e6
 
 
 @pytest.mark.thorough
 def test_what_is_shipped_beats_a_wiener_filter():
     """By 2.3 dB when written, whatever its strength, on a scene that it was not trained on."""
     config = load_as(LearnedConfig, Path(__file__).parents[2] / "configs/learned_refocus.yaml")
-    network = load(SHIPPED, build_camera(config))
+    network = RefocusNetwork.load(SHIPPED, build_camera(config))
     planes, picture = network.planes, dead_leaves(7, 1, 384)[0][:128, :128]
     scene = flat_scene(planes.camera, [picture], [np.ones(picture.shape)], [60.0])
     noise = tc.GaussianNoise(30.0)

@@ -106,7 +106,7 @@ def as_denoiser(denoiser: Any) -> Any:
             f"denoiser = {str(denoiser)[:60]!r}: give 'shipped', a file of thincam train, or a "
             "function of images and the deviation of their noise"
         )
-    return Denoiser(denoiser)
+    return Denoiser.load(denoiser)
 
 
 class PlugAndPlay(AbstractIterativeSolver):

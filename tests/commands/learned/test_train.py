@@ -12,7 +12,8 @@ from thincam_jax.commands import cli
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera
-from thincam_jax.learn.refocusing.store import described, load
+from thincam_jax.learn.refocusing.network import RefocusNetwork
+from thincam_jax.learn.refocusing.store import described
 from thincam_jax.learn.refocusing.train import NETWORK
 
 FILE = """
@@ -66,7 +67,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     assert result["trained"]["focus_psnr_db"] > 0 and result["linear"]["consistency"] > 0
     page = assert_says_its_result(out)
     assert "drawn" in page and page.count("data:image/") == 4
-    assert load(out / NETWORK, tiny.camera()).camera.planes == 2
+    assert RefocusNetwork.load(out / NETWORK, tiny.camera()).camera.planes == 2
     # The folder of a training is not begun anew by accident; what is finished stays as it is.
     assert "give --resume to go on with it" in line(call(file, "--out", out))
     before = (out / NETWORK).read_bytes()

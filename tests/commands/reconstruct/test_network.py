@@ -13,7 +13,6 @@ from learn import tiny_network as tiny
 from typer.testing import CliRunner
 
 from thincam_jax.commands import cli
-from thincam_jax.learn.refocusing.store import save
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +20,7 @@ def files(tmp_path_factory):
     """A camera, its network and a capture of 12 bit of a square at 80 mm."""
     folder, network = tmp_path_factory.mktemp("network"), tiny.network()
     (folder / "camera.yaml").write_text(FILE, "utf-8")
-    save(folder / "net.thincam", network)
+    network.save(folder / "net.thincam")
     scene = np.zeros((1, 14, 12))
     scene[0, 4:9, 3:8] = 1
     seen = network.camera.operator(jnp.asarray([80.0]))(jnp.asarray(scene + 0.2))

@@ -9,14 +9,7 @@ import pytest
 from helpers import finite_difference, relative_l2
 from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
 from thincam_jax.learn.denoiser import network as room
-from thincam_jax.learn.denoiser.network import (
-    Denoiser,
-    DenoiserOptions,
-    create,
-    load_network,
-    network_card,
-    save_network,
-)
+from thincam_jax.learn.denoiser.network import Denoiser, DenoiserOptions, create, network_card
 
 OPTIONS = DenoiserOptions((4, 6), (1, 1))
 
@@ -106,25 +99,25 @@ def test_wrong_input_is_told(network, image, sigma, told):
 
 
 def test_a_file_comes_back(network, tmp_path):
-    file = save_network(tmp_path / "net.thincam", network, {"steps": 3, "scores": [0.5]})
+    file = Denoiser(network).save(tmp_path / "net.thincam", {"steps": 3, "scores": [0.5]})
     card = network_card(file)
     assert card.scores == (0.5,) and card.options.widths == (4, 6)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), network)
-    assert eqx.tree_equal(Denoiser(file).network, single)
+    assert eqx.tree_equal(Denoiser.load(file).network, single)
 
 
 def test_a_file_of_no_use_is_told(network, tmp_path):
-    file = save_network(tmp_path / "net.thincam", network, {"images": ["a.png"]})
+    file = Denoiser(network).save(tmp_path / "net.thincam", {"images": ["a.png"]})
     with pytest.raises(CheckpointError, match="card of another version"):
         network_card(file)
     spoilt = eqx.tree_at(lambda n: n.leave, network, network.leave.at[0, 0, 1, 1].set(jnp.nan))
-    save_network(file, spoilt)
+    Denoiser(spoilt).save(file)
     with pytest.raises(CheckpointError, match="weights that are not finite; give an earlier file"):
-        load_network(file)
-    save_network(file, network)
+        Denoiser.load(file)
+    Denoiser(network).save(file)
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match="is damaged or cut off"):
-        load_network(file)
+        Denoiser.load(file)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +138,7 @@ def test_options_of_a_file_that_are_not_to_be_trusted(widths, blocks, network, t
     card = {"kind": room._KIND, "options": options, "training": {}}
     file = write_arrays(tmp_path / "net.thincam", network, card)
     with pytest.raises(CheckpointError, match="options of another version") as told:
-        load_network(file)
+        Denoiser.load(file)
     assert len(str(told.value)) < 500
 
 

@@ -16,7 +16,7 @@ import pytest
 from helpers import ROOT
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.crops import draw_crops, loss
-from thincam_jax.learn.denoiser.network import LEAST, MOST, DenoiserOptions, create, load_network
+from thincam_jax.learn.denoiser.network import LEAST, MOST, Denoiser, DenoiserOptions, create
 from thincam_jax.learn.denoiser.pictures import TILE, drawn, photographs, split
 from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, train_denoiser
 from thincam_jax.learn.training import TrainingOptions
@@ -123,7 +123,7 @@ def test_an_interrupted_training_ends_with_the_same_numbers(interrupted, whole, 
     assert steps[0] == 21 and steps[-1] == 60
     assert eqx.tree_equal(resumed.state, whole.state)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), whole.model)
-    assert eqx.tree_equal(load_network(tmp_path / NETWORK), single)
+    assert eqx.tree_equal(Denoiser.load(tmp_path / NETWORK).network, single)
     # The state is of this training alone, and whole.
     other = dataclasses.replace(OPTIONS, rate=1e-3)
     with pytest.raises(CheckpointError, match=r"training\.rate was 0\.02 and is 0\.001 here"):

@@ -17,7 +17,7 @@ from thincam_jax.commands.run_folder import to_json
 from thincam_jax.commands.schema import section
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser import pictures
-from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
+from thincam_jax.learn.denoiser.network import Denoiser, DenoiserOptions, create
 from thincam_jax.learn.denoiser.pictures import Pictures, united
 from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
@@ -90,7 +90,7 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
     if config.start is None:
         return create(options, key=config.seed)
     try:
-        network = load_network(config.start)
+        network = Denoiser.load(config.start).network
     except FileNotFoundError:
         fault = f"{config.start}: is missing; give a network's file, or 'shipped'"
         raise ConfigError(f"{config.place_of('start')}start: {fault}") from None

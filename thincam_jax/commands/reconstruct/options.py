@@ -351,10 +351,10 @@ def read_network(path: Path, cameras: Cameras) -> Focusing:
     **Errors**: ConfigError for a damaged file, another camera, and a distance outside of the range.
     """
     # Here: other captures need not wait for the learned parts.
-    from thincam_jax.learn.refocusing.store import load
+    from thincam_jax.learn.refocusing.network import RefocusNetwork
 
     try:
-        network = load(path, cameras)
+        network = RefocusNetwork.load(path, cameras)
         network.camera.within(cameras.object_distance)
     except ValueError as error:
         raise ConfigError(str(error)) from None

@@ -1,9 +1,8 @@
 """Reading a complete acquisition: its frames and their records."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -18,14 +17,37 @@ from thincam_jax.measured.exposures import ExposedFrames, MergedExposures, merge
 from thincam_jax.measured.raw import Raw
 
 
+class FrameRecord(TypedDict):
+    """Record of a frame: when it was `taken` (UTC), the camera's `number` and `time` (s), the
+    `exposure` (s), the stage's `position` (mm or None), the `saturated` pixels."""
+
+    digest: str
+    taken: str
+    number: int
+    time: float
+    exposure: float
+    position: float | None
+    saturated: int
+    retries: int
+
+
+class Provenance(TypedDict):
+    """Record of a run: its devices, and the settings `asked` for; `plan`: hash of the plan."""
+
+    plan: str
+    devices: dict[str, dict[str, str]]
+    versions: dict[str, str]
+    procedure: dict[str, float | int | None]
+    asked: list[dict[str, object]]
+    display_shape: NotRequired[tuple[int, int]]
+    begun: str
+
+
 @dataclass(frozen=True)
 class Acquisition:
     """A complete acquisition.
 
-    - `settings`: actual camera settings, one for each of `plan.settings`.
-    - `shots`: a record for each step: "digest", "taken" (UTC), the camera's "number" and "time"
-      (s), "exposure" (s), "position" (mm or None), "saturated" (pixels), "retries".
-    - `provenance`: "devices", "versions", "procedure", "begun", "asked" (settings), "plan" (hash).
+    - `settings`: actual camera settings, one for each of `plan.settings`; `shots`: one a step.
     """
 
     path: Path
@@ -33,8 +55,8 @@ class Acquisition:
     settings: tuple[CameraSettings, ...]
     bits: int
     sensor_shape: tuple[int, int]
-    shots: tuple[Mapping[str, Any], ...]
-    provenance: Mapping[str, Any]
+    shots: tuple[FrameRecord, ...]
+    provenance: Provenance
 
     @classmethod
     def load(cls, path: str | Path) -> "Acquisition":
@@ -46,7 +68,7 @@ class Acquisition:
         store = CaptureStore(path)
         attributes = store.attributes
         try:
-            begun = dict(attributes["acquisition"])
+            begun: Any = dict(attributes["acquisition"])
             plan = AcquisitionPlan.from_json(read_regular(path / PLAN).decode("utf-8"))
             settings = tuple(settings_from(record) for record in begun.pop("settings"))
             if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):

@@ -64,10 +64,7 @@ class Denoiser(Module):
     a D(y, \sigma) + b` for every a > 0 and b: images may be in any unit, with any offset. It was
     trained on linear light, for σ from 1/255 to 100/255 of the image's range.
 
-    **Arguments**: `network`, a file that a training wrote, "shipped", the one that comes with the
-    package, or a `DenoisingUNet`.
-
-    **Errors**: CheckpointError, one line, for a damaged file; OSError for what cannot be read.
+    **Arguments**: `network`, a `DenoisingUNet`; by default the one that comes with the package.
 
     >>> denoiser = Denoiser()
     >>> denoiser(jnp.zeros((3, 20, 31)), 0.1).shape
@@ -76,10 +73,33 @@ class Denoiser(Module):
 
     network: DenoisingUNet
 
-    def __init__(self, network: str | os.PathLike[str] | DenoisingUNet = SHIPPED):
-        if not isinstance(network, DenoisingUNet):
-            network = load_network(network)
-        self.network = network
+    def __init__(self, network: DenoisingUNet | None = None):
+        self.network = Denoiser.load(SHIPPED).network if network is None else network
+
+    def save(self, path: str | os.PathLike[str], training: dict[str, Any] | None = None) -> Path:
+        """Write the network, its options, and a record of its training: JSON."""
+        sizes = dict(zip(("widths", "blocks"), self.network.shape, strict=True))
+        description = {"kind": _KIND, "options": sizes, "training": training or {}}
+        return write_arrays(path, self.network, description)
+
+    @staticmethod
+    @checked
+    def load(path: str | os.PathLike[str]) -> "Denoiser":
+        """Read what a training wrote; `path` may be "shipped".
+
+        **Errors**: CheckpointError, one line, for a damaged file, one of another kind, and weights
+        that are not finite; OSError for what cannot be read.
+        """
+        path = _SHIPPED_FILE if str(path) == SHIPPED else path
+        description = network_description(path)
+        try:
+            options = _options(description)
+            like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
+        except Exception as error:  # whatever another's options bring about
+            cause = f"{path}: options of another version ({of_error(error)})"
+            raise CheckpointError(cause) from None
+        like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
+        return Denoiser(read_weights(path, like))
 
     def __call__(self, image: Numbers, sigma: Numbers) -> Float[Array, "*batch y x"]:
         """The denoised image.
@@ -136,35 +156,6 @@ def create(options: DenoiserOptions = DenoiserOptions(), *, key: Key) -> Denoisi
     return DenoisingUNet(options.widths, options.blocks, key=random_key(key))
 
 
-def save_network(
-    path: str | os.PathLike[str], network: DenoisingUNet, training: dict[str, Any] | None = None
-) -> Path:
-    """Write a network, its options, and a record of its training: JSON."""
-    description = {
-        "kind": _KIND,
-        "options": dict(zip(("widths", "blocks"), network.shape, strict=True)),
-        "training": training or {},
-    }
-    return write_arrays(path, network, description)
-
-
-def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
-    """Read a network; `path` may be "shipped".
-
-    **Errors**: CheckpointError, one line, for a damaged file, one of another kind, and weights
-    that are not finite; OSError for what cannot be read.
-    """
-    path = _SHIPPED_FILE if str(path) == SHIPPED else path
-    description = network_description(path)
-    try:
-        options = _options(description)
-        like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
-    except Exception as error:  # whatever another's options bring about
-        raise CheckpointError(f"{path}: options of another version ({of_error(error)})") from None
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
-    return read_weights(path, like)
-
-
 @dataclasses.dataclass(frozen=True)
 class NetworkCard:
     """Options, pictures and scores of a denoiser's training.
@@ -181,7 +172,7 @@ class NetworkCard:
 
 
 def network_card(path: str | os.PathLike[str] = SHIPPED) -> NetworkCard:
-    """Card of a network's file. **Errors**: as of `load_network`."""
+    """Card of a network's file. **Errors**: as of `Denoiser.load`."""
     path = _SHIPPED_FILE if str(path) == SHIPPED else path
     description = network_description(path)
     training = description["training"]

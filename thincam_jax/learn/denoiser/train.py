@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.crops import draw_crops, loss
-from thincam_jax.learn.denoiser.network import network_card, save_network
+from thincam_jax.learn.denoiser.network import Denoiser, network_card
 from thincam_jax.learn.denoiser.pictures import TILE, Pictures
 from thincam_jax.learn.denoiser.reconstructions import (
     draw_cameras,
@@ -138,6 +138,6 @@ def _keep(path: Path, settings, record, before: float, state: TrainingState) -> 
     scores = [round(float(score), 5) for score in state.scores if score == score]
     seconds = round(before + time.process_time(), 1)
     known = {**record, **state.counts, "scores": scores, "cpu_seconds": seconds}
-    save_network(path.parent / NETWORK, state.best, known)
+    Denoiser(state.best).save(path.parent / NETWORK, known)
     # Last: it is what training goes on from.
     write_state(path, state, settings)

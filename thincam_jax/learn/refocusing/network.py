@@ -10,8 +10,10 @@ last one says the rest, too: what a lens focused there sees beside what is rende
 the image in which all is sharp, and where each pixel stands.
 """
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -24,11 +26,16 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax._core.random import Key, random_key
+from thincam_jax._core.text import of_error
+from thincam_jax.learn.checkpoint import CheckpointError, read_weights, write_arrays
+from thincam_jax.learn.refocusing import store
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.linear import LinearStep
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.unet import UNet
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.reconstruction.imaging_model import Cameras
 
 
 @checked
@@ -159,6 +166,47 @@ class RefocusNetwork(eqx.Module):
             tuple(UNet(inputs, outputs, options.widths, key=k) for k in keys),
         )
         return RefocusNetwork(weights, Planes(camera), options)
+
+    def save(self, path: str | os.PathLike[str], record: dict[str, Any] | None = None) -> Path:
+        """Write the camera, the options, the `record` of the training, and the weights.
+
+        `record`: JSON, such as the entries of the images, their licences, and scores.
+        """
+        described = {"camera": store.described(self.camera), "options": asdict(self.options)}
+        description = {"kind": store.KIND, **described, "training": record or {}}
+        return write_arrays(path, self.weights, description)
+
+    @staticmethod
+    @checked
+    def load(
+        path: str | os.PathLike[str], cameras: LenslessCamera | RefocusCamera | Cameras
+    ) -> "RefocusNetwork":
+        """Read a network that was trained for this camera.
+
+        **Arguments**
+
+        - `path`: a file, or "shipped", the network that comes with the package.
+        - `cameras`: imaging model of the captures: the camera; the camera with its light, as
+          `Cameras`; or all that the network was trained for. Its numbers are compared, to single
+          precision.
+
+        **Errors**: CheckpointError, one line, for a damaged file, and for another camera with the
+        first number that differs and both its values; OSError for what cannot be read.
+        """
+        path = store.SHIPPED_FILE if str(path) == store.SHIPPED else path
+        description = store.network_description(path)
+        given = store.same_camera(str(path), description["camera"], cameras)
+        try:
+            stored = description["options"]
+            options = NetworkOptions(**{**stored, "widths": tuple(stored["widths"])})
+            structure = eqx.filter_eval_shape(
+                lambda key: RefocusNetwork.create(given, options, key=key).weights,
+                jax.random.key(0),
+            )
+        except Exception as error:  # whatever another's options bring about
+            cause = f"{path}: options of another version ({of_error(error)})"
+            raise CheckpointError(cause) from None
+        return RefocusNetwork(read_weights(path, structure), Planes(given), options)
 
     @property
     def camera(self) -> RefocusCamera:

@@ -10,84 +10,28 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from thincam_jax._core.arguments import checked
-from thincam_jax._core.text import of_error
 from thincam_jax.imaging.scene import Spectrum
-from thincam_jax.learn.checkpoint import (
-    CheckpointError,
-    difference,
-    read_description,
-    read_weights,
-    write_arrays,
-)
+from thincam_jax.learn.checkpoint import CheckpointError, difference, read_description
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
-from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras
 
-_KIND = "refocusing network"
+KIND = "refocusing network"
 # By this name the network that comes with the package is known, of configs/learned_refocus.yaml.
 SHIPPED = "shipped"
-_SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
+SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
 # Arrays of more numbers are stored as their sum.
 _LISTED = 64
 # What a sensor makes of light; a network takes captures in any unit.
 _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
 
 
-@checked
-def save(
-    path: str | os.PathLike[str], network: RefocusNetwork, record: dict[str, Any] | None = None
-) -> Path:
-    """Write a network: its camera, its options, the `record` of its training, and its weights.
-
-    `record`: JSON, such as the entries of the images, their licences, and scores.
-    """
-    description = {
-        "kind": _KIND,
-        "camera": described(network.camera),
-        "options": dataclasses.asdict(network.options),
-        "training": record or {},
-    }
-    return write_arrays(path, network.weights, description)
-
-
-@checked
-def load(
-    path: str | os.PathLike[str], cameras: LenslessCamera | RefocusCamera | Cameras
-) -> RefocusNetwork:
-    """Read a network that was trained for this camera.
-
-    **Arguments**
-
-    - `path`: a file, or "shipped", the network that comes with the package.
-    - `cameras`: imaging model of the captures: the camera; the camera with its light, as `Cameras`;
-      or all that the network was trained for. Its numbers are compared, to single precision.
-
-    **Errors**: CheckpointError, one line, for a damaged file, and for another camera with the
-    first number that differs and both its values; OSError for what cannot be read.
-    """
-    path = _SHIPPED_FILE if str(path) == SHIPPED else path
-    description = network_description(path)
-    given = same_camera(str(path), description["camera"], cameras)
-    try:
-        stored = description["options"]
-        options = NetworkOptions(**{**stored, "widths": tuple(stored["widths"])})
-        structure = eqx.filter_eval_shape(
-            lambda key: RefocusNetwork.create(given, options, key=key).weights, jax.random.key(0)
-        )
-    except Exception as error:  # whatever another's options bring about
-        raise CheckpointError(f"{path}: options of another version ({of_error(error)})") from None
-    return RefocusNetwork(read_weights(path, structure), Planes(given), options)
-
-
 def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Card of a network's file: `camera`, `options`, `training`."""
     description = read_description(path)
     parts = (description.get(name) for name in ("camera", "options", "training"))
-    if description.get("kind") != _KIND or not all(isinstance(part, dict) for part in parts):
-        raise CheckpointError(f"{path}: holds no {_KIND}; give a file that a training wrote")
+    if description.get("kind") != KIND or not all(isinstance(part, dict) for part in parts):
+        raise CheckpointError(f"{path}: holds no {KIND}; give a file that a training wrote")
     return description
 
 

@@ -19,7 +19,7 @@ from thincam_jax.learn.refocusing.loss import Examples, examples, loss
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch, SceneOptions, draw_batch
 from thincam_jax.learn.refocusing.sources import Entry, Source, as_json
-from thincam_jax.learn.refocusing.store import described, save
+from thincam_jax.learn.refocusing.store import described
 from thincam_jax.learn.training import (
     Task,
     Trained,
@@ -168,7 +168,7 @@ def _keep(path: Path, network: RefocusNetwork, settings, record, state: Training
     number = network.options.steps - 1
     best = network.with_prior(number, eqx.combine(state.best, network.weights.prior[number]))
     scores = [float(score) for score in state.scores if score == score]
-    save(path.parent / NETWORK, best, {**record, "scores": scores, **state.counts})
+    best.save(path.parent / NETWORK, {**record, "scores": scores, **state.counts})
     # Last: it is what training goes on from.
     write_state(path, state, settings)
 

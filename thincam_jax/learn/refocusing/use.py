@@ -14,7 +14,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.learn.refocusing.network import RefocusNetwork, explain, flattened
-from thincam_jax.learn.refocusing.store import SHIPPED, described, load, same_camera
+from thincam_jax.learn.refocusing.store import SHIPPED, described, same_camera
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.recording import Recording
@@ -83,7 +83,7 @@ class Learned(AbstractSolver):
     may be made up where the capture does not tell: see `Reconstruction.consistency` and
     `Reconstruction.confidence`.
 
-    - `network`: trained, see `thincam_jax.learn.load`; default the one that comes with the package,
+    - `network`: trained, see `RefocusNetwork.load`; default the one that comes with the package,
       for its camera.
     - `output`: "focus", or "all_in_focus", which needs no distance.
 
@@ -98,7 +98,7 @@ class Learned(AbstractSolver):
 
     mask = tc.FresnelZoneAperture(beta=13.0, width=5.6)
     thin = tc.LenslessCamera(mask, tc.Sensor((256, 256), 44 * um), distance=7.5)
-    network = learn.load("shipped", thin)
+    network = learn.RefocusNetwork.load("shipped", thin)
     solver = tc.Learned(network, output="focus")
     ```
 
@@ -116,7 +116,7 @@ class Learned(AbstractSolver):
         began, model = time.perf_counter(), recording.imaging_model
         if not isinstance(model, Cameras):
             raise ValueError("a learned method knows its camera; give a recording by tc.Cameras")
-        network = load(SHIPPED, model) if self.network is None else self.network
+        network = RefocusNetwork.load(SHIPPED, model) if self.network is None else self.network
         camera = network.camera
         same_camera("the network", described(camera), model)
         if model.pixels not in (None, camera.field_shape):
