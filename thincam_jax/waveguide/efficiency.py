@@ -67,12 +67,10 @@ def diffraction_efficiency(
 
     0 where no wave is diffracted back (c_S ≥ 0): there it would be a transmission hologram.
 
-    A `lensless.AccuracyWarning` says where "kogelnik" is over 0.033 from "exact"; traced rays
-    have none.
-
     - `phase`: "kogelnik", as bands and ghost weights have it: within 0.03 of rigorous coupled waves
       at Δn = 0.012, 0.08 at 0.02, 0.17 at 0.03, integrals within 0.7 %. "exact", of the diffracted
-      wave's own direction, for single rays: 0.0013, 0.007, 0.027 (TE; a film of 16 µm).
+      wave's own direction, for single rays: 0.0013, 0.007, 0.027 (TE; a film of 16 µm). Where the
+      two differ by over 0.033, a `lensless.AccuracyWarning` says so, but of traced rays.
     """
     checks.choice("polarisation", polarisation, ("TE", "TM"))
     exact = checks.choice("phase", phase, ("kogelnik", "exact")) == "exact"
