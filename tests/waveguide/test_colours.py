@@ -1,6 +1,7 @@
 """Full-colour screens against a direct sum over wavelengths, and against coupled waves."""
 
 import functools
+from contextlib import nullcontext
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +14,15 @@ from helpers import relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.lensless import AccuracyWarning
 from thincam_jax.units import deg, nm, um
 from thincam_jax.waveguide.colours import colour_system
 from thincam_jax.waveguide.efficiency import diffraction_efficiency
 from thincam_jax.waveguide.rays import pixel_centres
 from thincam_jax.waveguide.system import LitPlane
 
+# Of strong films the formula is tested, not what it is an approximation of.
+pytestmark = pytest.mark.filterwarnings("ignore:η by Kogelnik:UserWarning")
 RECORDED = ((633 * nm, 60 * deg), (532 * nm, 61.2 * deg), (473 * nm, 62 * deg))
 INDEX, THICKNESS, GLASS, PINHOLE, GAP, DISTANCE = 1.5, 16 * um, 5.0, 6.0, 10.0, 550.0
 
@@ -81,7 +85,9 @@ def test_two_gratings_of_one_film_are_coupled_waves(second, modulation, most, al
     waves = np.linspace(second - 20, 552, 300) * nm
     vectors = [np.asarray(film.grating) for film in films]
     exact = np.stack([coupled_waves(*vectors, wave, modulation) for wave in waves], axis=1)
-    both, own = camera(films), jnp.zeros((len(waves), 2))
+    near = "two gratings 6 nm apart count as independent, and their bands overlap"
+    with pytest.warns(AccuracyWarning, match=near) if second == 526 else nullcontext():
+        both, own = camera(films), jnp.zeros((len(waves), 2))
     for number, vector in enumerate(vectors):
         guided = -waves[:, None] / (2 * np.pi) * vector[:2]
         found = both.coupled(jnp.asarray(guided), jnp.asarray(waves))[0][number][0]

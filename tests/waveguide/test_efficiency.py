@@ -1,11 +1,14 @@
 """Kogelnik's closed form against his coupled equations, and ghost weights against quadrature."""
 
+from contextlib import nullcontext
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
 from waveguide.setting import RECORDED, hologram
 
+from thincam_jax.lensless import AccuracyWarning
 from thincam_jax.units import nm
 from thincam_jax.waveguide.efficiency import (
     _coupling,
@@ -13,6 +16,9 @@ from thincam_jax.waveguide.efficiency import (
     diffraction_efficiency,
     ghost_weights,
 )
+
+# Of strong films the formula is tested, not what it is an approximation of.
+pytestmark = pytest.mark.filterwarnings("ignore:η by Kogelnik:UserWarning")
 
 
 def coupled_waves(film, across, wavelength, polarisation):
@@ -151,6 +157,9 @@ def rigorous(film, across, wavelength, orders=(-1, 0, 1, 2)):
     return abs(back[one]) ** 2 * upright[one].real / upright[zero].real
 
 
+STRONG = r"η by Kogelnik's phase is 0\.[012]\d off at an index .* of 0\.0[23]: give phase='exact'"
+
+
 @pytest.mark.parametrize(
     ("modulation", "kogelnik", "exact"),
     [(0.012, 0.033, 0.0015), (0.02, 0.085, 0.008), (0.03, 0.18, 0.028)],
@@ -164,7 +173,9 @@ def test_rigorous_coupled_waves(modulation, kogelnik, exact):
         expected = np.array([rigorous(film, across, w) for w in wavelengths])
         rays = jnp.broadcast_to(jnp.asarray(across), (121, 2)), jnp.asarray(wavelengths)
         for phase, found in worst.items():
-            eta = np.asarray(diffraction_efficiency(film, *rays, phase=phase))
+            strong = modulation > 0.012 and phase == "kogelnik"
+            with pytest.warns(AccuracyWarning, match=STRONG) if strong else nullcontext():
+                eta = np.asarray(diffraction_efficiency(film, *rays, phase=phase))
             found.append(abs(eta - expected).max())
             assert eta.sum() == pytest.approx(expected.sum(), rel=0.01)
     assert kogelnik / 2 < max(worst["kogelnik"]) < kogelnik

@@ -18,6 +18,21 @@ RESULT_ROUNDING: dict[Precision, float] = {"float32": 3e-8, "float64": 1e-16}
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
+class AccuracyWarning(UserWarning):
+    """A default trades accuracy for time, or is used where it is some per cent off.
+
+    ```python
+    import warnings
+
+    import thincam_jax as tc
+
+    warnings.simplefilter("ignore", tc.lensless.AccuracyWarning)
+    ```
+
+    **See also**: `PsfMethod`, `lensless.sampling.SamplingWarning`.
+    """
+
+
 def precision_of(array: Any) -> Precision:
     """The precision of a floating array."""
     return "float64" if array.dtype == jnp.float64 else "float32"

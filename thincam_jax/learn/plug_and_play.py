@@ -27,10 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.precision import AccuracyWarning
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.learn.residual_noise import ResidualNoise, residual_noise
-from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
 from thincam_jax.reconstruction.methods import AdmmTV, starts_uniform
 from thincam_jax.reconstruction.normal_equations import (

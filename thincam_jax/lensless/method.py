@@ -11,7 +11,7 @@ import numpy as np
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import PRECISIONS, Precision, precision_of
+from thincam_jax._core.precision import PRECISIONS, AccuracyWarning, Precision, precision_of
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -51,21 +51,6 @@ _LATTICE = (
     f"{LATTICE_POINTS} points a pixel, 1 to 4 % off where cells are fine; "
     "PsfMethod({!r}, nodes=144) is five times closer, and takes seven times as long"
 )
-
-
-class AccuracyWarning(UserWarning):
-    """A default trades accuracy for time, or planes of an image cannot be told apart.
-
-    ```python
-    import warnings
-
-    import thincam_jax as tc
-
-    warnings.simplefilter("ignore", tc.lensless.AccuracyWarning)
-    ```
-
-    **See also**: `PsfMethod`, `lensless.sampling.SamplingWarning`.
-    """
 
 
 def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:

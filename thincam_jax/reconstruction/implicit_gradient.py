@@ -160,10 +160,7 @@ _UNIFORM = 1e-8
 
 
 def _with_level(splitting: AbstractSplitting, image: Image) -> Image:
-    """The image less its darkest pixel, where a background leaves its brightness open.
-
-    How bright it is then depends on the path of the iteration, which has no implicit derivative.
-    """
+    """The image less its darkest pixel, where only the iteration's path says how bright it is."""
     data: Any = getattr(splitting, "problem", splitting)
     if data.background == "known":
         return image

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core.checks import is_traced
+from thincam_jax._core.precision import AccuracyWarning
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, plane_mean
-from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one
 from thincam_jax.reconstruction.uniform_light import high_passed, window_length
 

@@ -21,6 +21,8 @@ Independent gratings approximate coupled waves: ∫η² to 0.4 % for lasers 59 n
 nm, where bands of 9 nm overlap, to 1.4–11 and 11–13 %; without losses it is 8 and 41 % off.
 """
 
+import itertools
+import warnings
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -33,16 +35,22 @@ from jaxtyping import Array, Float, Int
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
-from thincam_jax._core.precision import product
+from thincam_jax._core.precision import AccuracyWarning, product
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
+from thincam_jax.units import nm
 from thincam_jax.waveguide.camera import SeeThroughCamera
-from thincam_jax.waveguide.efficiency import in_blocks, least_nodes, unpolarised
+from thincam_jax.waveguide.efficiency import axial_band, in_blocks, least_nodes, unpolarised
 from thincam_jax.waveguide.hologram import VolumeHologram
 from thincam_jax.waveguide.rays import at_rear, on_object, pixel_centres, shift, straight_on
 from thincam_jax.waveguide.smear import SmearedRays, equal_parts, guided_band, meets
 from thincam_jax.waveguide.system import ObjectPlane, seen_size, system_matrix
 
+# Neighbouring gratings whose bands overlap by half or more.
+_NEAR = (
+    "two gratings {:.2g} nm apart count as independent, and their bands overlap: integrals of "
+    "their light are some 12 % off; record them farther apart"
+)
 Crosstalk = Literal["none", "bands", "all"]
 
 
@@ -75,7 +83,8 @@ class ColourCamera(Module):
 
     - `cameras`: one for each grating, which differ in their hologram alone: in one film, each with
       its own index modulation, or in films one on the other. They count as independent: 12 nm
-      apart, where bands overlap, integrals are up to 11 % off, 6 nm apart 11 to 13 %.
+      apart, where bands begin to overlap, integrals are up to 11 % off, 6 nm apart 11 to 13 %:
+      nearer than a band is wide, there is a `lensless.AccuracyWarning`.
     - `responses`: responses of the sensor's channels. `primaries`: spectra of the object's
       channels, as those of a monitor; None for those of the sensor.
     """
@@ -92,6 +101,12 @@ class ColourCamera(Module):
         first, *others = (eqx.tree_at(lambda c: c.screen.hologram, c, 0) for c in self.cameras)
         if not all(checks.is_traced(c.sensor.pitch) or eqx.tree_equal(c, first) for c in others):
             raise ValueError("cameras differ in more than their hologram; give one, with each")
+        if checks.holds_traced(self.cameras):
+            return
+        bands = sorted(axial_band(one.screen.hologram) for one in self.cameras)
+        for (low, narrow), (high, wide) in itertools.pairwise(bands):
+            if 0 < low and high - low < (narrow + wide) / 2:
+                warnings.warn(_NEAR.format((high - low) / nm), AccuracyWarning, stacklevel=4)
 
     @property
     def channels(self) -> tuple[int, int]:

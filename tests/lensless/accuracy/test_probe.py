@@ -11,6 +11,7 @@ from lensless.accuracy import cameras
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless import LightPath
+from thincam_jax.lensless.accuracy import probe as probe_module
 from thincam_jax.lensless.accuracy.lines import fine_fields
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.method import PsfMethod
@@ -213,3 +214,24 @@ def test_one_compilation_for_cameras_of_one_structure(caplog):
     jax.clear_caches()
     assert any("closed_terms" in line for line in compilations(case_of((48, 80), 5.5e-3)))
     assert compilations(case_of((300, 77), 0.011, beta=60.0, distance=1.0)) == []
+
+
+def test_models_without_nodes_are_compiled_once(monkeypatch):
+    """Whatever the fringes of a pixel: in `explore` each number of nodes made a program of each."""
+    given = set()
+
+    class Asked(Exception):
+        pass
+
+    def asked(mask, points, path, method):
+        given.add((method.model, method.nodes))
+        raise Asked
+
+    monkeypatch.setattr(probe_module, "closed_terms", asked)
+    for pitch in (0.02, 0.2):
+        probe = probe_of(case_of((12, 15), pitch, average=True))
+        for model in CLOSED:
+            with pytest.raises(Asked):
+                probe.closed(model, "float64")
+    assert len(given) == 5  # "separable" by its numbers
+    assert {nodes for model, nodes in given if model != "separable"} == {None}

@@ -206,7 +206,7 @@ class MaskProbe:
         self.given: dict[Precision, tuple[AbstractFactoredMask, Array, LightPath]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
-        self._cache: dict[tuple[Model, Precision, int], Factors] = {}
+        self._cache: dict[tuple[Model, Precision, int | None], Factors] = {}
 
     @functools.cached_property
     def scale(self) -> float:
@@ -215,7 +215,8 @@ class MaskProbe:
 
     def closed(self, model: Model, precision: Precision, nodes: int | None = None) -> Factors:
         """Factors of one of the closed forms, averages by default as `psf` has them."""
-        nodes = nodes or self.nodes
+        # Other models take none, and would be compiled for each number.
+        nodes = (nodes or self.nodes) if model == "separable" else None
         key = model, precision, nodes
         if key not in self._cache:
             with allow(precision):
