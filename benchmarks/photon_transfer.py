@@ -59,7 +59,8 @@ class Simulated:
             return np.array(every)
 
         return measure_sensor(
-            [ExposedFrames(one, taken(one, 1.0), taken(one, 0.0)) for one in self.times], FULL
+            [ExposedFrames(one, taken(one, 1.0), taken(one, 0.0)) for one in self.times],
+            full_scale=FULL,
         )
 
 

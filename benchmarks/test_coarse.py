@@ -48,7 +48,7 @@ def test_a_colour_capture(capsys):
     found = {}
     for name, (result, seconds) in rows.items():
         scores = [
-            float(psnr(align(np.asarray(i), t)[0], t))
+            float(psnr(align(np.asarray(i), t), t))
             for i, t in zip(result.image, truth, strict=True)
         ]
         found[name] = (seconds, min(p.objective for p in result.history), np.mean(scores))

@@ -38,7 +38,9 @@ PATTERNS = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "G
 
 def computed(mask, distance, shape):
     camera = tc.LenslessCamera(mask, tc.Sensor(shape, 0.03), distance)
-    return np.asarray(tc.psf(camera, wavelength=5.5e-4, object_distance=200.0), float)
+    return np.asarray(
+        tc.psf(camera, wavelength=5.5e-4, object_distance=200.0, pixel_integration=False), float
+    )
 
 
 def diffuser(rng):

@@ -59,7 +59,7 @@ def test_psf_off_the_axis(benchmark):
 @pytest.mark.parametrize("way", ["forward", "adjoint"])
 def test_operator_over_the_field(benchmark, way):
     own, shape = camera(512), (426, 426)
-    fit = tc.field_operator(own, 500 * nm, 250.0, field_shape=shape)
+    fit = tc.field_operator(own, 500 * nm, object_distance=250.0, field_shape=shape)
     one = imaging_operator(own, 500 * nm, 250.0, field_shape=shape)
     pieces = jnp.zeros((81, *shape), jnp.float32)
     kernels = jnp.ones((81, 937, 937), jnp.float32)

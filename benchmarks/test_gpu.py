@@ -59,7 +59,10 @@ def gradient():
     def slopes(numbers):
         where = lambda c: (c.mask.beta, c.distance)  # noqa: E731
         camera = eqx.tree_at(where, given, numbers)
-        return jnp.sum(weight * tc.psf(camera, wavelength=500 * nm, object_distance=250.0))
+        return jnp.sum(
+            weight
+            * tc.psf(camera, wavelength=500 * nm, object_distance=250.0, pixel_integration=False)
+        )
 
     numbers = jnp.float32(25.0), jnp.float32(6.5)
     return lambda: jnp.stack(slopes(numbers))
@@ -74,7 +77,7 @@ def many_psfs():
     @jax.vmap
     def psfs(beta):
         camera = tc.LenslessCamera(tc.FresnelZoneAperture(beta, width=2.8), sensor, 6.5)
-        return tc.psf(camera, wavelength=500 * nm, object_distance=250.0)
+        return tc.psf(camera, wavelength=500 * nm, object_distance=250.0, pixel_integration=False)
 
     return lambda: psfs(betas)
 
@@ -82,7 +85,9 @@ def many_psfs():
 def sampled_psf():
     """Angular spectrum of any mask, 1024², 3 × 3 samples a pixel."""
     given, model = test_public.camera(), tc.PsfMethod("angular_spectrum", oversampling=3)
-    return lambda: tc.psf(given, wavelength=500 * nm, object_distance=250.0, model=model)
+    return lambda: tc.psf(
+        given, wavelength=500 * nm, object_distance=250.0, model=model, pixel_integration=False
+    )
 
 
 def wiener():

@@ -31,8 +31,8 @@ def psf(model, cell, distance):
         jnp.asarray(WAVELENGTH, cell.dtype), distance, jnp.asarray(jnp.inf, cell.dtype)
     )
     if model == "separable":
-        return separable(mask, grid, path).image()
-    method = PsfMethod("angular_spectrum", mask_shape=SHAPE)
+        return separable(mask, grid, path, pixel_integration=False).image()
+    method = PsfMethod("angular_spectrum", pixel_integration=False, mask_shape=SHAPE)
     return angular_spectrum(mask, grid, path, method, padding=2.0)
 
 

@@ -143,7 +143,9 @@ def measured(kind):
     else:
         mask = tc.FresnelZoneAperture(13.0, width=4.2)
         own = tc.LenslessCamera(mask, tc.Sensor((96, 96), 44 * um), 7.5)
-        psf = np.asarray(tc.psf(own, wavelength=LIGHT, object_distance=100.0))
+        psf = np.asarray(
+            tc.psf(own, wavelength=LIGHT, object_distance=100.0, pixel_integration=False)
+        )
     psf = (psf / psf.sum()).astype(np.float32)
     model = tc.Psfs(psf[None], field_shape=(191, 191))
     blank = tc.Recording(np.zeros((1, 96, 96), np.float32), model)
@@ -297,7 +299,7 @@ DISTANCE = perceptual_distance()
 
 def scores(result, truth):
     """Of each plane, after one gain and offset for all of them."""
-    image = np.asarray(align(result.image, truth)[0]).reshape(-1, *truth.shape[-2:])
+    image = np.asarray(align(result.image, truth)).reshape(-1, *truth.shape[-2:])
     return [
         [float(psnr(i, t, aligned=False)), ssim(i, t, aligned=False), DISTANCE(i, t)]
         for i, t in zip(image, truth.reshape(image.shape), strict=True)
@@ -365,7 +367,7 @@ def test_plug_and_play(name, capsys):
     unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", side).images[:COUNT]
     tuning = photographs(PHOTOGRAPHS / "cc0", side).images[4:12:4]
     page = middle_square(sample_image("page", linear=True), SIDE)
-    drawn = [page if side == SIDE else resize(page, (side, side)), usaf1951((side, side), 2)]
+    drawn = [page if side == SIDE else resize(page, (side, side)), usaf1951((side, side), layers=2)]
     record, gains = CASES[name](), []
     for noise in NOISES:
         if noise.endswith("e") and name in ("FlatCam", "screen"):

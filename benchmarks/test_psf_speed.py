@@ -44,8 +44,8 @@ def psf(model, beta, distance, wavelength, object_distance, oversampling=1, padd
     grid = tc.Grid(SHAPE, jnp.asarray(PITCH, dtype))
     path = LightPath(wavelength, distance, object_distance)
     if model == "separable":
-        return separable(mask, grid, path).image()
-    method = tc.PsfMethod(model, oversampling=oversampling, mask_shape=SHAPE)
+        return separable(mask, grid, path, pixel_integration=False).image()
+    method = tc.PsfMethod(model, None, False, oversampling, SHAPE)
     return angular_spectrum(mask, grid, path, method, padding=padding)
 
 

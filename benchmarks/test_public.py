@@ -72,8 +72,15 @@ def modes():
 
 def psf():
     given = camera()
-    inside = given.mask, given.sensor.grid, given.path(LIGHT, FAR), PsfMethod("separable")
-    return lambda: tc.psf(given, wavelength=LIGHT, object_distance=FAR), lambda: _psf(*inside)
+    inside = (
+        given.mask,
+        given.sensor.grid,
+        given.path(LIGHT, FAR),
+        PsfMethod("separable", None, False),
+    )
+    return lambda: tc.psf(
+        given, wavelength=LIGHT, object_distance=FAR, pixel_integration=False
+    ), lambda: _psf(*inside)
 
 
 def capture():

@@ -94,7 +94,7 @@ def score(model, capture, image, *, turned):
     found = np.asarray(tc.reconstruct(tc.Recording(capture, model), tc.AdmmTV()).image)
     found = found.reshape(image.shape)
     truth = image[::-1, ::-1] if turned else image
-    return float(psnr(align(found, truth)[0], truth))
+    return float(psnr(align(found, truth), truth))
 
 
 def run(right, given, number, wanted, *, parameters=None):

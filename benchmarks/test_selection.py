@@ -61,7 +61,9 @@ def ways_of(camera):
 
 def evaluate(camera, conditions, way):
     model, precision = way
-    return jax.block_until_ready(tc.psf(camera, model=tc.PsfMethod(model, precision), **conditions))
+    return jax.block_until_ready(
+        tc.psf(camera, model=tc.PsfMethod(model, precision), **conditions, pixel_integration=False)
+    )
 
 
 def in_double(*trees):
@@ -95,7 +97,7 @@ def measure(camera, conditions):
 def judge(camera, conditions, tolerance, times, errors):
     """Whether the choice meets the tolerance, and its time over that of the fastest that does."""
     start = time.perf_counter()
-    choice = tc.choose_model(camera, tolerance=tolerance, **conditions)
+    choice = tc.choose_model(camera, tolerance=tolerance, **conditions, pixel_integration=False)
     took = time.perf_counter() - start
     way = (choice.method.model, choice.method.precision)
     met = errors.get(way, math.inf) <= tolerance

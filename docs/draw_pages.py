@@ -53,7 +53,7 @@ def models():
     titles = ("near the axis", "half way to the edge", "at the mask's edge")
     for ax, low, title in zip(panels, (0.0, 1.4, 2.76), titles, strict=True):
         for model, (grey, dashes) in styles.items():
-            line = tc.psf(camera, model=model, **light)[0]
+            line = tc.psf(camera, model=model, **light, pixel_integration=False)[0]
             ax.plot(camera.sensor.grid.x, line, color=grey, linestyle=dashes, label=model, lw=1.2)
         ax.set(xlim=(low, low + 0.18), ylim=(0, 1.35), title=title, xlabel="x on the sensor (mm)")
     panels[0].set_ylabel("irradiance (open aperture = 1)")

@@ -99,7 +99,7 @@ images = {
     "three full frames": np.stack([image(full[k], models[k]) for k in range(3)]),
 }
 scores = {
-    name: [float(psnr(align(a, t)[0], t)) for a, t in zip(found, truth, strict=True)]
+    name: [float(psnr(align(a, t), t)) for a, t in zip(found, truth, strict=True)]
     for name, found in images.items()
 }
 for name, each in scores.items():
@@ -109,7 +109,7 @@ for name, each in scores.items():
 # %%
 figure, axes = plt.subplots(1, 4, figsize=(14, 4), layout="constrained")
 for ax, (name, found) in zip(axes, {"scene": truth, **images}.items(), strict=True):
-    shown = [align(a, t)[0] for a, t in zip(found, truth, strict=True)]
+    shown = [align(a, t) for a, t in zip(found, truth, strict=True)]
     picture = np.clip(np.stack([np.asarray(one) for one in shown], axis=-1), 0, 1)
     ax.imshow(picture, extent=(-65, 65, 65, -65))
     mean = "" if name == "scene" else f", {np.mean(scores[name]):.1f} dB"

@@ -48,7 +48,13 @@ def responses(beta, distance, y):
         mask = tc.FresnelZoneAperture(beta, quarter * math.pi / 2, width=width, centre=centre)
         camera = tc.LenslessCamera(mask, sensor, distance)
         at = ((1 + scale) * y, 0.0)
-        h = tc.otf(camera, wavelength=500 * nm, object_distance=object_distance, at=at)
+        h = tc.otf(
+            camera,
+            wavelength=500 * nm,
+            object_distance=object_distance,
+            at=at,
+            pixel_integration=False,
+        )
         found.append(np.asarray(h) / width**2)
     return np.array(found)
 

@@ -134,7 +134,7 @@ def on_sensor(distance, shape):
 def with_true_field(shot):
     shape = (2 * math.ceil(field * shot[2] / far / 2),) * 2
     fit = tc.field_operator(
-        camera(*shot), 500 * nm, object_distance, field_shape=shape, tolerance=3e-3
+        camera(*shot), 500 * nm, object_distance=object_distance, field_shape=shape, tolerance=3e-3
     )
     return fit.operator(on_sensor(shot[2], shape))
 
@@ -185,7 +185,7 @@ images = {(kind, name): reconstructed(kind, name) for kind in clean for name in 
 
 shot = scan_far[0]
 shape = (field, field)
-fit = tc.field_operator(camera(*shot), 500 * nm, object_distance, field_shape=shape)
+fit = tc.field_operator(camera(*shot), 500 * nm, object_distance=object_distance, field_shape=shape)
 print(f"{fit.operator.weights.shape[0]} convolutions, error {fit.truncation_error:.1e}")
 alone = tc.Cameras([camera(*shot)], field_shape=shape, **light)
 for name, model in (("TV, axis PSF", alone), ("TV, field operator", [fit.operator])):
@@ -209,7 +209,7 @@ cells = np.arange(field).reshape(5, -1)
 
 def quality_of(image):
     """PSNR (dB) and finest line pair (mm), the median of the tiles, for each ring."""
-    photo = align(image[1], truth[1])[0]
+    photo = align(image[1], truth[1])
     errors, finest = np.zeros((5, 5)), np.zeros((5, 5))
     for i, j in np.ndindex(5, 5):
         place = np.ix_(cells[i], cells[j])
@@ -248,7 +248,7 @@ panels = [
 figure, axes = plt.subplots(1, len(panels), figsize=(15, 3.5), sharey=True, layout="constrained")
 half = object_width / 2
 for ax, (title, image) in zip(axes, panels, strict=True):
-    shown = align(image, truth[1])[0]
+    shown = align(image, truth[1])
     ax.imshow(shown, cmap="gray", vmin=0, vmax=1, extent=(-half, half, half, -half))
     ax.set_title(title, fontsize=9)
     ax.set(xlabel="x on the object (mm)")

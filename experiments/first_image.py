@@ -82,10 +82,10 @@ print(f"mask {width:.2f} mm wide, β = {beta} rad/mm²; sensor of {shape} pixels
 # package's default, `model="separable"`, is the exact Fresnel field of the square aperture, with
 # its edges.
 
-psf = np.asarray(tc.psf(camera, **light))
+psf = np.asarray(tc.psf(camera, **light, pixel_integration=False))
 models = ("separable", "paraxial", "geometric")
 line = camera.on_grid(tc.Grid((1, 4000), width / 4000))  # finer than the pixels, along x
-along = {model: tc.psf(line, model=model, **light)[0] for model in models}
+along = {model: tc.psf(line, model=model, **light, pixel_integration=False)[0] for model in models}
 
 # %%
 # A capture
@@ -181,7 +181,7 @@ panels = [
 ]
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), sharey=True, layout="constrained")
 for ax, (image, title) in zip(axes, panels, strict=True):
-    show(ax, align(image, truth)[0], wiener.pitch, title, "object", vmin=0, vmax=1)
+    show(ax, align(image, truth), wiener.pitch, title, "object", vmin=0, vmax=1)
     ax.label_outer()
 figure.savefig(FIGURES / "images.png", dpi=110)
 
@@ -202,7 +202,7 @@ axes["curve"].text(taus[0], quality["wiener"] + 0.2, "Wiener filter", color="0.3
 axes["curve"].set(xlabel="τ (standard deviations of the noise)", ylabel="PSNR (dB)")
 axes["curve"].set_title("reconstruction against τ")
 for name, tau in (("least", taus[0]), ("most", taus[-1])):
-    image = align(by_tau[tau].image, truth)[0]
+    image = align(by_tau[tau].image, truth)
     show(axes[name], image, wiener.pitch, f"τ = {tau:g}", "object", vmin=0, vmax=1)
 figure.savefig(FIGURES / "tau.png", dpi=110)
 

@@ -37,7 +37,7 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 shape, pitch, width = ((24, 32), 50 * um, 0.84) if SMALL else ((48, 64), 50 * um, 1.2)
 sensor, field = tc.Sensor(shape, pitch), (shape[0] // 2, shape[1] // 2)
 wide = tc.Grid((shape[0] + field[0] - 1, shape[1] + field[1] - 1), pitch)
-chart = jnp.asarray(siemens_star(field, 6 if SMALL else 12), jnp.float32)[
+chart = jnp.asarray(siemens_star(field, spokes=6 if SMALL else 12), jnp.float32)[
     None, None
 ]  # (channel, plane, y, x)
 ORDERED, TRUE = 46.0, 50.0
@@ -47,7 +47,10 @@ def problem_of(beta, tau, difference):
     """The difference of both captures, in which the bright background cancels, explained by β."""
     masks = [tc.FresnelZoneAperture(beta, phase, width=width) for phase in (0.0, math.pi)]
     cameras = [tc.LenslessCamera(mask, sensor, 4.0).on_grid(wide) for mask in masks]
-    psfs = [tc.psf(camera, wavelength=500 * nm, object_distance=200.0) for camera in cameras]
+    psfs = [
+        tc.psf(camera, wavelength=500 * nm, object_distance=200.0, pixel_integration=False)
+        for camera in cameras
+    ]
     model = tc.Psfs((psfs[0] - psfs[1])[None], field_shape=field)
     return tc.Recording(difference[None], model, noise_variance=NOISE**2).problem(tau=tau)
 

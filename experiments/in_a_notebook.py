@@ -27,7 +27,7 @@ part, count = (4, 128) if os.environ.get("THINCAM_SIZE") == "small" else (1, 512
 betas, sensor = (25.0 * part, 21.0 * part), tc.Sensor((count, count), 11 * um)
 at = {"distance": 250.0, "width": 180.0 / part}  # of the targets, mm
 targets = [tc.studies.Target.usaf1951(**at), tc.studies.Target.photograph("astronaut", **at)]
-result = tc.studies.superresolution(betas, sensor=sensor, targets=targets, noise=36.0).run()
+result = tc.studies.superresolution(betas=betas, sensor=sensor, targets=targets, noise=36.0).run()
 print(result.table())
 pictures = [result.plot(target.name) for target in targets]
 
@@ -52,7 +52,7 @@ tolerances = tc.plot.sensitivity(tc.design.sensitivity_around(problem, best))
 # ----------------------------------------------------------------
 
 marked = {"start": base, "found": best.design}
-landscape = tc.design.landscape_around(problem, best.design, 31).plot(marked)
+landscape = tc.design.landscape_around(problem, best.design, count=31).plot(marked)
 thin = {distance: problem.with_thickness(distance) for distance in (2.0, 2.5, 3.0)}
 front = tc.design.find_front(thin, search, key=key)
 curve = tc.plot.front(front, "longest distance (mm)")

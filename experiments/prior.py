@@ -70,7 +70,7 @@ def found(recording, plane, method):
     result = tc.reconstruct(recording, method)
     grid = tc.Grid(result.image.shape, result.pitch)
     truth = np.asarray(plane.sample(grid, magnification=1.0))
-    return np.asarray(align(result.image, truth)[0]), float(psnr(result.image, truth))
+    return np.asarray(align(result.image, truth)), float(psnr(result.image, truth))
 
 
 scene = on_plane(picture)

@@ -73,7 +73,7 @@ else:
 # a log of it. The noise is estimated from the capture.
 
 raws = {name: measured.read_image(path, bits=bits) for name, path in paths.items()}
-ready = measured.prepare(raws["psf"], raws["capture"], raws.get("dark"), options)
+ready = measured.prepare(raws["psf"], raws["capture"], background=raws.get("dark"), options=options)
 noise = pixel_noise(ready)
 solver = tc.AdmmTV(tau=2.0, iterations=100)
 found = reconstruct_prepared(ready, solver, noise)
@@ -99,7 +99,7 @@ figure.savefig(FIGURES / "reconstruction.png", dpi=110)
 
 blocks = max(1, ready.capture.shape[-1] // 100) * options.downsample  # some 100 pixels are enough
 coarse = replace(options, downsample=blocks, psf_scale=0.97)
-wrong = measured.prepare(raws["psf"], raws["capture"], raws.get("dark"), coarse)
+wrong = measured.prepare(raws["psf"], raws["capture"], background=raws.get("dark"), options=coarse)
 check = tc.check_psf(tc.Recording([wrong.capture], tc.Psfs(wrong.psf[None])))
 print(check)
 print(f"of the scene's size {0.97 * check.scale / shadow:.4f} ± {0.97 * check.scale_error:.4f}")

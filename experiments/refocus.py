@@ -44,7 +44,7 @@ scene = tc.Scene(
 )
 noise = tc.GaussianNoise(snr_db=40.0, signal_power="without_mean")
 captures = [tc.capture(camera, scene, key=n, noise=noise) for n, camera in enumerate(cameras)]
-resolved = [float(depth.axial_resolution(cameras[0], t)) for t in (near, far)]
+resolved = [float(depth.axial_resolution(cameras[0], object_distance=t)) for t in (near, far)]
 print("depth of focus, mm:", *(f"{t:.1f}" for t in resolved))
 
 # %%

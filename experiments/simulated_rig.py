@@ -72,7 +72,7 @@ settings = CameraSettings(exposure=20e-3, pixel_format="Mono12")
 plan = plans.method_b(mask, (25.0, 21.0), settings, dark_frames=1).at_position(0.0)
 with (
     tempfile.TemporaryDirectory() as folder,
-    tc.hardware.open_rig(drivers, display_pitch, virtual) as rig,
+    tc.hardware.open_rig(drivers, display_pitch, virtual=virtual) as rig,
 ):
     shown = [rig.render(plan.pattern(step)) for step in plan.steps]
     procedure = Procedure(settle=5e-3, timeout=2.0, saturated=0.01)

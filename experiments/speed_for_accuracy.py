@@ -60,7 +60,7 @@ rows, columns = {"full": (1024, 1024), "small": (96, 128)}[SIZE]
 width = 5.632
 mask = tc.FresnelZoneAperture(beta=25.0, width=width)
 camera = tc.LenslessCamera(mask, tc.Sensor((rows, columns), width / columns), distance=6.5)
-light = {"wavelength": 500 * nm, "object_distance": 250.0}
+light = {"wavelength": 500 * nm, "object_distance": 250.0, "pixel_integration": False}
 
 choice = tc.choose_model(camera, tolerance=0.1, **light)
 print(f"{choice.method.model}, {choice.method.precision}: predicted {choice.predicted_error:.3f}")
@@ -134,7 +134,7 @@ for _ in range({"full": 40, "small": 6}[SIZE]):
     drawn = tc.LenslessCamera(
         tc.FresnelZoneAperture(beta, width=size), tc.Sensor((96, 128), size / 128), distance
     )
-    seen = {"wavelength": random.uniform(450, 650) * nm, "object_distance": far}
+    seen = light | {"wavelength": random.uniform(450, 650) * nm, "object_distance": far}
     exact = tc.psf(drawn, model=exactly, **seen)
     for model in closed_forms:
         way = {"model": tc.PsfMethod(model, "float32"), **seen}

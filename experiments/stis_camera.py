@@ -76,7 +76,7 @@ for order, grey in enumerate(("0.0", "0.4", "0.65")):
         # The ray's direction is that to the order's virtual source.
         slope = -places[order] / distance - m / sources[order]
         pixel = jnp.asarray([[-distance * slope, 0.0]])
-        ray = wg.trace(camera, pixel, far, orders)
+        ray = wg.trace(camera, pixel, object_distance=far, orders=orders)
         bounce = 5.0 * float(ray.guided[0, 1]) / np.sqrt(1.5**2 - float(ray.guided[0, 1]) ** 2)
         inside = slope / np.sqrt(1 + slope**2) / 1.5
         crossing = 5.0 * inside / np.sqrt(1 - inside**2)
@@ -114,7 +114,12 @@ def plate(centre):
 def shadow(mask_at, sensor, grid, wavelength, source, place):
     """What a mask casts, with its middle imaged at a place of the sensor."""
     lensless = tc.LenslessCamera(mask_at(place / (1 + distance / source)), sensor, distance)
-    return tc.psf(lensless.on_grid(grid), wavelength=wavelength, object_distance=source)
+    return tc.psf(
+        lensless.on_grid(grid),
+        wavelength=wavelength,
+        object_distance=source,
+        pixel_integration=False,
+    )
 
 
 grid = kernel_grid(sensor.grid, field)

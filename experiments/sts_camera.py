@@ -67,7 +67,7 @@ figure, ax = plt.subplots(figsize=(10, 4.2), layout="constrained")
 greys = [("0.0", "-"), ("0.45", "--"), ("0.65", ":")]
 for (grey, dashes), pixel in zip(greys, (-0.9, 0.0, 0.9), strict=True):
     along = np.array([[pixel, 0.0]])
-    rays = wg.trace(camera, jnp.asarray(along), distance, 3)
+    rays = wg.trace(camera, jnp.asarray(along), object_distance=distance, orders=3)
     slope = -pixel / 6.0  # of the ray in air
     inside = slope / np.sqrt(1 + slope**2) / 1.5
     crossing = 5.0 * inside / np.sqrt(1 - inside**2)
@@ -97,7 +97,7 @@ figure.savefig(FIGURES / "rays.png", dpi=110)
 # ghosts' distance on the object varies too: no convolution describes this camera.
 
 pixels = pixel_centres(camera)
-rays = wg.trace(camera, pixels, distance, orders)
+rays = wg.trace(camera, pixels, object_distance=distance, orders=orders)
 colours = np.asarray(rays.wavelength) / nm
 shifts = np.asarray(rays.points[1] - rays.points[0])[..., 1]
 print(f"colours {colours.min():.0f} to {colours.max():.0f} nm")
@@ -121,7 +121,7 @@ figure.savefig(FIGURES / "field.png", dpi=110)
 # paths in the glass: a ghost is smeared along the screen, wider with every order, and the side
 # lobes of the band show in it. Grey is what a pixel sees.
 
-middle = wg.trace(camera, jnp.zeros((1, 2)), distance, 3)
+middle = wg.trace(camera, jnp.zeros((1, 2)), object_distance=distance, orders=3)
 band = trace_band(camera, jnp.zeros((1, 2)), distance, 3, 2048)
 pixel_seen = 4.8e-3 * binned * (10.0 + distance) / 6.0
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
@@ -142,13 +142,13 @@ figure.savefig(FIGURES / "smear.png", dpi=110)
 # is wrong: ghosts forgotten, or the glass taken for 2 % thicker than it is?
 
 plane = wg.ObjectPlane((64, 64), distance, 150.0, (27.0, 0.0))
-system = wg.system_operator(camera, plane, orders)
+system = wg.system_operator(camera, plane, orders=orders)
 scenes = {"camera": resize(sample_image("camera", linear=True), (64, 64))}
 scenes["text"] = resize(sample_image("page", linear=True)[:180, :180], (64, 64))
 models = {
     "right model": system,
-    "glass 2 % thicker": wg.system_operator(see_through(5.1), plane, orders),
-    "without ghosts": wg.system_operator(camera, plane, 1),
+    "glass 2 % thicker": wg.system_operator(see_through(5.1), plane, orders=orders),
+    "without ghosts": wg.system_operator(camera, plane, orders=1),
 }
 iterations = {"full": 100, "small": 30}[SIZE]
 images, reached = {}, {}

@@ -93,7 +93,7 @@ patterns = np.stack([hadamard_pattern(n, shape, "natural") > 0 for n in numbers]
 @functools.cache
 def rays(shift=0.0, nearer=0.0):
     plane = wg.ObjectPlane(shape, 550.0 - nearer, 110.0, (20.0 + shift, shift))
-    return wg.system_operator(camera, plane, 4, 8)
+    return wg.system_operator(camera, plane, orders=4, samples=8)
 
 
 def frames(setup, system, shown, random):

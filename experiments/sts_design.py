@@ -138,11 +138,11 @@ images = {"scene": np.stack(list(scenes.values()))}
 reached = {}
 for name, plate in plates.items():
     camera = plate.camera(sensor)
-    rays = wg.trace(camera, jnp.zeros((1, 2)), viewing.object_distance, 4)
+    rays = wg.trace(camera, jnp.zeros((1, 2)), object_distance=viewing.object_distance, orders=4)
     centre = jnp.sum(rays.points[:, 0, 1] * rays.weight[:, 0]) / jnp.sum(rays.weight)
     middle = jnp.stack([centre, jnp.zeros_like(centre)])
     plane = wg.ObjectPlane(cells, viewing.object_distance, viewing.object_width, middle)
-    system = wg.system_operator(camera, plane, 4, 6)
+    system = wg.system_operator(camera, plane, orders=4, samples=6)
     light = worth[name].light
     variance = noise_variance(viewing, light) / light**2
     clean = system(jnp.asarray(images["scene"], light.dtype))

@@ -76,14 +76,16 @@ captures = [c + deviation * jax.random.normal(k, c.shape) for c, k in zip(clean,
 
 shapes = (cells, cells), (pixels, pixels)
 spots = rng.uniform(-1, 1, (12, 2))[:, ::-1]  # (y, x), mm on the sensor
-points = np.asarray(wg.trace(camera, spots, plane.distance, 3).points)[..., 1::-1]
+points = np.asarray(wg.trace(camera, spots, object_distance=plane.distance, orders=3).points)[
+    ..., 1::-1
+]
 points = points - np.asarray(plane.centre) + 0.3 * rng.standard_normal(points.shape)[..., ::-1]
 ghosts = GhostPositions(
     np.tile(spots, (3, 1)), points.reshape(-1, 2), np.repeat(np.arange(3), 12), 0.3
 )
 start = wg.SeeThroughCamera(wg.Screen(hologram, 5.1, 1.5, *places), sensor, 6.0, 10.0)
 free = ("glass_thickness", "slant", "tilt", "object_x", "object_y")
-fit = fit_screen(ghosts, start, plane, free, samples=None)
+fit = fit_screen(ghosts, start, plane, parameters=free, samples=None)
 glass, error = fit.values["glass_thickness"], fit.standard_errors["glass_thickness"]
 print(f"fitted glass {glass:.3f} ± {error:.3f} mm, {fit.status}")
 

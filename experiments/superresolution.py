@@ -97,7 +97,9 @@ def along_u(response):
 
 def scanned(distance):
     """H_FS of a distance without its carrier e^{jX}, real, on the reference plane's scale."""
-    response = along_u(fringe_scanned_otf(camera(beta_1, 0, distance), **light))
+    response = along_u(
+        fringe_scanned_otf(camera(beta_1, 0, distance), **light, pixel_integration=False)
+    )
     on_the_sensor = beta_1 / (1 + distance / 250.0) ** 2  # the shadow is magnified by 1 + d/t
     response = (response * np.exp(-1j * math.pi**2 * frequency**2 / on_the_sensor)).real
     # A frequency of the reference plane is far/distance times as high on this sensor.
@@ -106,7 +108,7 @@ def scanned(distance):
 
 def pair(beta):
     """H_B of a pitch."""
-    return along_u(phase_pair_otf(camera(beta, 0, far), **light))
+    return along_u(phase_pair_otf(camera(beta, 0, far), **light, pixel_integration=False))
 
 
 def root_mean_square(responses):
@@ -241,7 +243,7 @@ panels += [(name, result.image, result.pitch) for name, result in results.items(
 for column, (name, images, object_pitch) in zip(axes.T, panels, strict=True):
     half = float(object_pitch) * images.shape[-1] / 2
     for ax, image, truth in zip(column, images, truths.get(name, images), strict=False):
-        aligned = align(image, truth)[0]
+        aligned = align(image, truth)
         ax.imshow(aligned, cmap="gray", vmin=0, vmax=1, extent=(-half, half, half, -half))
         ax.set(xlabel="x on the object (mm)")
     column[0].set(xlim=(-0.07 * object_width, 0.17 * object_width))  # the chart's finer layers

@@ -94,7 +94,9 @@ def made(psf, capture, background=DARK, bayer=None):
     assert examined.psf is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        ready = measured.prepare(examined.psf, examined.captures[0], background, options)
+        ready = measured.prepare(
+            examined.psf, examined.captures[0], background=background, options=options
+        )
     done = reconstruct_prepared(ready, SOLVER, pixel_noise(ready))
     said = [str(one).partition(": ")[2] for one in examined.findings] + [done.found.reason]
     return done.image(), "; ".join(filter(None, said))

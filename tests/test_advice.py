@@ -148,8 +148,18 @@ CASES = {
     ),
     "zones whose phase single precision does not hold": Case(
         "give PsfMethod('separable', precision='float64')",
-        lambda: tc.psf(fine_zones(), **LIGHT, model=tc.PsfMethod("separable", "float32")),
-        lambda: tc.psf(fine_zones(), **LIGHT, model=tc.PsfMethod("separable", precision="float64")),
+        lambda: tc.psf(
+            fine_zones(),
+            **LIGHT,
+            model=tc.PsfMethod("separable", "float32"),
+            pixel_integration=False,
+        ),
+        lambda: tc.psf(
+            fine_zones(),
+            **LIGHT,
+            model=tc.PsfMethod("separable", precision="float64"),
+            pixel_integration=False,
+        ),
     ),
 }
 
@@ -157,7 +167,10 @@ CASES = {
 def prepared(**options: Any) -> Any:
     psf = measured.Raw(np.repeat(CAPTURE[..., None], 3, axis=-1), name="psf.tif")
     return measured.prepare(
-        psf, measured.Raw(CAPTURE[..., None], name="raw.tif"), 0.0, measured.Preparation(**options)
+        psf,
+        measured.Raw(CAPTURE[..., None], name="raw.tif"),
+        background=0.0,
+        options=measured.Preparation(**options),
     )
 
 

@@ -359,7 +359,10 @@ def test_learned_thesis_page(monkeypatch):
             found = optics(camera, distances)
             row = [f"{found['depth of focus']:.0f} mm", f"{found['wider']:.2g}"]
             assert f"| {' | '.join(row)} | {found['difference']:.2f} |" in page
-        assert round(float(script["axial_resolution"](thesis(2048).camera, 160.0))) == 46
+        assert (
+            round(float(script["axial_resolution"](thesis(2048).camera, object_distance=160.0)))
+            == 46
+        )
         leaves = list(script["dead_leaves"](7, 4, 32).astype(float))
 
         def lost(camera, distances):

@@ -285,6 +285,7 @@ def slope_in_double(camera, pitch, centre, weights, shape, model, pixel_integrat
         wavelength=camera["wavelength"],
         object_distance=camera["object_distance"],
         model=tc.PsfMethod(model, "float64", pixel_integration),
+        pixel_integration=False,
     )
     return jnp.sum(weights * h)
 

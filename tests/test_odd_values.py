@@ -21,7 +21,9 @@ def zones(beta):
 
 
 def distant(object_distance):
-    return tc.psf(CAMERA, wavelength=500 * nm, object_distance=object_distance)
+    return tc.psf(
+        CAMERA, wavelength=500 * nm, object_distance=object_distance, pixel_integration=False
+    )
 
 
 ITSELF: list = []
@@ -43,8 +45,12 @@ NUMBERS = {
     "mask": zones,
     "pitch": lambda value: tc.Sensor((3, 4), value),
     "distance": distant,
-    "wavelength": lambda value: tc.psf(CAMERA, wavelength=value, object_distance=250.0),
-    "at": lambda value: tc.psf(CAMERA, wavelength=500 * nm, object_distance=250.0, at=value),
+    "wavelength": lambda value: tc.psf(
+        CAMERA, wavelength=value, object_distance=250.0, pixel_integration=False
+    ),
+    "at": lambda value: tc.psf(
+        CAMERA, wavelength=500 * nm, object_distance=250.0, at=value, pixel_integration=False
+    ),
     "shape": lambda value: tc.Sensor(value, 0.06),
     "tau": tc.AdmmTV,
     "snr": tc.GaussianNoise,

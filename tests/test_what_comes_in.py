@@ -6,7 +6,9 @@ what the lab knows. Rows that are not as good name the option or the fault that 
 
 import json
 import warnings
+from typing import Any
 
+import equinox as eqx
 import numpy as np
 import PIL.Image
 import pytest
@@ -127,6 +129,18 @@ def test_arrays_that_carry_meaning(image_of):
     given["capture"] = np.where(dead, np.nan, spoilt)
     given = {name: one.astype(np.float32) for name, one in given.items()}
     assert quality(image_of(**given)[0], TRUE) > best - WITHIN
+
+
+def test_numbers_in_place_of_leaves():
+    """`eqx.tree_at` puts a Python number where a camera holds an array."""
+    mask = tc.FresnelZoneAperture(beta=20.0, width=3.0)
+    camera, same = (
+        tc.LenslessCamera(m, tc.Sensor((36, 48), 80 * um), 4.0)
+        for m in (mask, tc.FresnelZoneAperture(beta=26.0, width=3.0))
+    )
+    changed = eqx.tree_at(lambda c: c.mask.beta, camera, 26.0)
+    light: Any = {"wavelength": 550 * nm, "object_distance": 200.0}
+    np.testing.assert_allclose(tc.psf(changed, **light), tc.psf(same, **light))
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])

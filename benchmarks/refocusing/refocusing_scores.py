@@ -132,7 +132,7 @@ def scores(
     return {
         "psnr": psnr(image[inside][:, None], target[inside][:, None]),
         "ssim": ssim(image, target),
-        "ms_ssim": multiscale_ssim(align(image, target)[0], target),
+        "ms_ssim": multiscale_ssim(align(image, target), target),
     }
 
 

@@ -64,7 +64,7 @@ def optics(camera: RefocusCamera, distances) -> dict[str, float]:
     kernels = np.asarray(camera.kernels(jnp.asarray(distances, camera.near.dtype)), float)
     one, other = kernels - kernels.mean(axis=(1, 2), keepdims=True)
     return {
-        "depth of focus": float(axial_resolution(thin, near)),
+        "depth of focus": float(axial_resolution(thin, object_distance=near)),
         "wider": float(wider),
         "difference": float(np.linalg.norm(one - other) / np.linalg.norm(one)),
     }

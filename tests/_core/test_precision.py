@@ -58,10 +58,15 @@ def test_double_precision_without_the_switch(model, average):
 def test_transfer_function_in_double_precision():
     """Complex results come back in the camera's precision as well."""
     single, double = single_camera()
-    expected = np.asarray(tc.otf(double, **conditions("float64")))
+    expected = np.asarray(tc.otf(double, **conditions("float64"), pixel_integration=False))
     with jax.enable_x64(False):
-        value = tc.otf(single, model=tc.PsfMethod(precision="float64"), **conditions("float32"))
-        own = tc.otf(single, **conditions("float32"))
+        value = tc.otf(
+            single,
+            model=tc.PsfMethod(precision="float64"),
+            **conditions("float32"),
+            pixel_integration=False,
+        )
+        own = tc.otf(single, **conditions("float32"), pixel_integration=False)
     assert value.dtype == own.dtype == jnp.complex64
     error = relative_l2(np.asarray(value, complex), expected)
     assert error < 5e-8 < relative_l2(np.asarray(own, complex), expected)
@@ -70,11 +75,15 @@ def test_transfer_function_in_double_precision():
 @pytest.mark.parametrize("model", quick(MODELS[:-1], 0, 3))
 def test_single_precision_of_a_double_camera(model):
     """Comes back in float64, with the error of float32: neither none, nor more than a few 1e-5."""
-    expected = tc.psf(camera_of(), model=model, **CONDITIONS)
-    value = tc.psf(camera_of(), model=tc.PsfMethod(model, "float32"), **CONDITIONS)
+    expected = tc.psf(camera_of(), model=model, **CONDITIONS, pixel_integration=False)
+    value = tc.psf(
+        camera_of(), model=tc.PsfMethod(model, "float32"), **CONDITIONS, pixel_integration=False
+    )
     assert value.dtype == expected.dtype == jnp.float64
     assert 1e-8 < relative_l2(value, expected) < 3e-5
-    same = tc.psf(camera_of(), model=tc.PsfMethod(model, "float64"), **CONDITIONS)
+    same = tc.psf(
+        camera_of(), model=tc.PsfMethod(model, "float64"), **CONDITIONS, pixel_integration=False
+    )
     np.testing.assert_array_equal(same, expected)
 
 
@@ -84,7 +93,9 @@ def total(single, precision):
     def of(distance):
         camera = tc.LenslessCamera(single.mask, single.sensor, distance)
         method = tc.PsfMethod(precision=precision)
-        return jnp.sum(tc.psf(camera, model=method, **conditions("float32")) ** 2)
+        return jnp.sum(
+            tc.psf(camera, model=method, **conditions("float32"), pixel_integration=False) ** 2
+        )
 
     return of
 
@@ -107,7 +118,7 @@ def test_traced_numbers_with_the_switch(transform):
 
     def exact(distance):
         camera = tc.LenslessCamera(double.mask, double.sensor, distance)
-        return jnp.sum(tc.psf(camera, **given) ** 2)
+        return jnp.sum(tc.psf(camera, **given, pixel_integration=False) ** 2)
 
     expected = float(transform(exact)(jnp.asarray(6.5)))
     value = transform(total(single, "float64"))(jnp.float32(6.5))

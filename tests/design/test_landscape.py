@@ -16,7 +16,7 @@ from thincam_jax.design.space import Limits
 
 def test_of_two_variables():
     problem = small.problem(Bowl())
-    around = landscape_around(problem, problem.space.base, 5)
+    around = landscape_around(problem, problem.space.base, count=5)
     assert around.variables == (("beta", (1,)), ("beta", (2,)))
     np.testing.assert_allclose(around.axes, [[12, 16.5, 21, 25.5, 30]] * 2)
     assert around.costs.shape == (5, 5)
@@ -29,26 +29,26 @@ def test_of_one_and_of_three_variables():
     """One is a line; of more, the first two, the others as in the given design."""
     one = (small.shared("beta", 12.0, 30.0),)
     problem = small.problem(Bowl(), one)
-    line = landscape_around(problem, problem.space.base, 3)
+    line = landscape_around(problem, problem.space.base, count=3)
     assert line.variables == (("beta", (1, 2)),)
     expected = [1 + (b - 20) ** 2 + 2 * (b - 15) ** 2 + 3 for b in (12, 21, 30)]
     np.testing.assert_allclose(line.costs, expected)
     problem = small.problem(Bowl(), (*small.BETAS, small.shared("distance", 2.0, 3.0)))
     best = found_at(problem, 20.0, 17.0, 2.2).design
-    around = landscape_around(problem, best, 3)
+    around = landscape_around(problem, best, count=3)
     assert around.costs[0, -1] == pytest.approx(1 + 8**2 + 2 * 15**2 + 2.2)
 
 
 def test_limits_narrow_it():
     """π / (0.08 mm · 2 mm) = 19.6 rad/mm²; at a thickness of 2 mm no room is left."""
     problem = small.problem(Bowl(), limits=Limits(mask_pixel=0.08))
-    around = landscape_around(problem, found_at(problem, 13.0, 13.0).design, 3)
+    around = landscape_around(problem, found_at(problem, 13.0, 13.0).design, count=3)
     assert around.axes[0][-1] == pytest.approx(np.pi / 0.08 / 2)
     flat = (Variable("distance", 2.0, 3.0, (0, 1, 2, 3)),)
     problem = small.problem(Bowl(), flat, limits=Limits(thickness=2.0))
     assert landscape_if_any(problem, problem.space.base, 3) is None
     with pytest.raises(ValueError, match="widen their bounds"):
-        landscape_around(problem, problem.space.base, 3)
+        landscape_around(problem, problem.space.base, count=3)
 
 
 def test_over_a_width():
@@ -56,13 +56,13 @@ def test_over_a_width():
     variables = (small.shared("beta", 12.0, 30.0, 2), small.shared("width", 1.0, 2.5, 0))
     design = small.pairs([14.0], width=1.5)
     tied = small.problem(Slope(), variables, small.pairs([15.0]), Limits(mask_pixel=0.08))
-    around = landscape_around(tied, design, 5)
+    around = landscape_around(tied, design, count=5)
     finest = np.pi / 0.08 / 1.5
     assert around.variables == (("beta", (1,)),)
     np.testing.assert_allclose(around.axes[0][-1], finest)
     np.testing.assert_allclose(around.costs[-1], 1 + (finest - 14) ** 2 / 4)
     free = small.problem(Slope(), variables, small.pairs([15.0]))
-    assert landscape_around(free, design, 5).variables == (("width", ()), ("beta", (1,)))
+    assert landscape_around(free, design, count=5).variables == (("width", ()), ("beta", (1,)))
 
 
 def test_which_numbers_are_drawn():

@@ -166,7 +166,7 @@ def test_refinement_comes_nearer_to_the_target(retrieved):
 def test_refinement_end_to_end(retrieved):
     """Through the solver: restored images, crop and noise included, come nearer to the truth."""
     _, mask, limits = retrieved
-    images = np.stack([siemens_star((24, 24), n) for n in (6, 10)]) + 0.5
+    images = np.stack([siemens_star((24, 24), spokes=n) for n in (6, 10)]) + 0.5
     training = Training(
         images,
         setup(),

@@ -57,7 +57,7 @@ def test_expected_error_is_that_of_the_exact_system(numbers):
     judged = judge_plate(plate, VIEWING)
     camera = plate.camera(VIEWING.sensor)
     seen = ObjectPlane((10, 10), 550.0, 150.0, (18.0, 0.0))
-    operator = system_operator(camera, seen, 4, samples=6)
+    operator = system_operator(camera, seen, orders=4, samples=6)
     matrix = np.zeros((30 * 30, 100))
     np.add.at(matrix, (np.asarray(operator.rows), np.asarray(operator.columns)), operator.values)
     y, x = (np.fft.fftfreq(20, 15.0) for _ in range(2))

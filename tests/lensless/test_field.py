@@ -26,7 +26,9 @@ AVERAGED = tc.PsfMethod("separable", pixel_integration=True, nodes=55)
 
 @pytest.fixture(scope="module")
 def fit():
-    return tc.field_operator(CAMERA, 500 * nm, 250.0, field_shape=FIELD, model=AVERAGED)
+    return tc.field_operator(
+        CAMERA, 500 * nm, object_distance=250.0, field_shape=FIELD, model=AVERAGED
+    )
 
 
 def captured_alone(row, column):
@@ -79,7 +81,9 @@ def test_the_axis_psf_is_far_off_at_the_corner(fit):
 def test_a_small_field_is_a_convolution():
     """Within its tolerance, of one term, and as bright."""
     field = (11, 8)
-    fit = tc.field_operator(CAMERA, 500 * nm, 250.0, field_shape=field, model=AVERAGED)
+    fit = tc.field_operator(
+        CAMERA, 500 * nm, object_distance=250.0, field_shape=field, model=AVERAGED
+    )
     assert fit.operator.weights.shape[0] == 1
     image = np.random.default_rng(0).uniform(size=field)
     alone = imaging_operator(CAMERA, 500 * nm, 250.0, field_shape=field)

@@ -31,11 +31,18 @@ def test_settings_that_are_refused(settings, message):
 
 def test_defaults_follow_from_mask_and_grid():
     mask, grid = tc.Pinhole(0.5), tc.Grid((32, 48), np.float32(0.02))
-    assert psf_method(mask, grid, "separable") == tc.PsfMethod("separable", "float32")
+    assert psf_method(mask, grid, "separable", pixel_integration=False) == tc.PsfMethod(
+        "separable", "float32"
+    )
     found = psf_method(mask, grid, "angular_spectrum", pixel_integration=True)
     assert found == tc.PsfMethod("angular_spectrum", "float32", True, 3, (25, 25))
-    assert psf_method(mask, grid, found) == found
-    assert psf_method(mask, grid, tc.PsfMethod("angular_spectrum", "float64")).samples == 1
+    assert psf_method(mask, grid, found, pixel_integration=False) == found
+    assert (
+        psf_method(
+            mask, grid, tc.PsfMethod("angular_spectrum", "float64"), pixel_integration=False
+        ).samples
+        == 1
+    )
 
 
 def test_an_average_that_the_method_asks_for():

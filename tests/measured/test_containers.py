@@ -152,7 +152,7 @@ def test_packed_frames_by_the_line_that_the_refusal_gives(tmp_path, bits, paddin
         read_image(path)
     line = str(caught.value).split("; ")[1].replace("bits=10", f"bits={bits}")
     exec(line, {"numpy": np, "measured": measured, "rows": 6, "columns": 12})
-    np.testing.assert_array_equal(read_image(tmp_path / "a.npy", bits).pixels, counts)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.npy", bits=bits).pixels, counts)
     with pytest.raises(measured.MeasurementError, match="bytes are no 6×40 of"):
         unpack_raw(path, (6, 40), bits)
 

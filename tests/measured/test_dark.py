@@ -45,8 +45,8 @@ def test_a_psf_that_fills_the_sensor_has_no_dark_corner():
     assert log.capture.level == (0.0,) and abs(4095 * log.psf.level[0] - BLACK) < 40
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        prepare(psf, capture, BLACK)  # as the warning advises
-        untested = prepare(psf, capture, "corner").log
+        prepare(psf, capture, background=BLACK)  # as the warning advises
+        untested = prepare(psf, capture, background="corner").log
     assert untested.psf.background == "corner" and untested.psf.clipped > 0.5 * psf.pixels.size
     assert log.psf.clipped < 0.2 * untested.psf.clipped
 

@@ -102,7 +102,7 @@ def image_of(psf, capture, background: float = DARK, options=None, iterations=40
 
 
 def plain_image(psf, capture, background: float = DARK, options=None, iterations=40):
-    ready = prepare(psf, capture, background, options)
+    ready = prepare(psf, capture, background=background, options=options)
     solver = tc.AdmmTV(iterations=iterations)
     return reconstruct_prepared(ready, solver, pixel_noise(ready)).image()
 

@@ -71,7 +71,7 @@ def test_a_dng_works_by_default(files):
     psf, capture = files
     found = Inputs(Sources(psf)).prepare(capture)
     raws = read_image(psf), read_image(capture)
-    expected = prepare(*raws, BLACK, Preparation(bayer="BGGR"))
+    expected = prepare(*raws, background=BLACK, options=Preparation(bayer="BGGR"))
     np.testing.assert_array_equal(found.capture, expected.capture)
     np.testing.assert_array_equal(found.psf, expected.psf)
     assert (
@@ -108,8 +108,11 @@ def test_facts_are_not_dropped_in_python(files):
     """`prepare` takes pattern and black level of the files, and refuses what contradicts them."""
     raws = [read_image(path) for path in files]
     with pytest.raises(MeasurementError, match="black level of 256, not a dark corner"):
-        prepare(*raws, "corner")
-    found, given = prepare(*raws), prepare(*raws, BLACK, Preparation(bayer="BGGR"))
+        prepare(*raws, background="corner")
+    found, given = (
+        prepare(*raws),
+        prepare(*raws, background=BLACK, options=Preparation(bayer="BGGR")),
+    )
     assert found.capture.shape == (3, *SHAPE)
     np.testing.assert_array_equal(found.capture, given.capture)
 

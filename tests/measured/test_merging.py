@@ -47,7 +47,7 @@ def test_as_good_as_a_psf_that_is_not_saturated(camera):
     def score(psf):
         return quality(plain_image(psf, capture)[0], true)
 
-    assert prepare(merged, capture, DARK).log.psf.saturated == 0
+    assert prepare(merged, capture, background=DARK).log.psf.saturated == 0
     assert score(merged) > score(best) - 0.5
     if camera != "coarse cells":  # of which a saturated PSF shows all
         assert score(merged) > score(images[2]) + 1

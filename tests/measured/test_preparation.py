@@ -51,12 +51,14 @@ def test_one_channel_with_the_corner_as_background():
 def test_dark_frames_and_numbers():
     psf, capture, dark = measured(), measured(seed=12), measured(seed=13) // 8
     options = Preparation(capture_scale="none")
-    found = prepare(Raw(psf, 12), Raw(capture, 12), Raw(dark, 12), options)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), background=Raw(dark, 12), options=options)
     expected = np.maximum(capture.astype(float) - dark, 0) / 4095
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5, atol=1e-7)
     light = np.maximum(psf.astype(float) - dark, 0)
     np.testing.assert_allclose(found.psf[0], unit_sum(light), rtol=1e-5, atol=1e-9)
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 50, options, psf_background=0)
+    found = prepare(
+        Raw(psf, 12), Raw(capture, 12), background=50, options=options, psf_background=0
+    )
     expected = np.maximum(capture.astype(float) - 50, 0) / 4095
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(found.psf[0], unit_sum(psf.astype(float)), rtol=1e-5)
@@ -66,7 +68,7 @@ def test_dark_frames_and_numbers():
 def test_raw_data_are_left_as_they_were():
     psf, capture = measured(3), measured(3, seed=12)
     kept = psf.copy(), capture.copy()
-    first, second = (prepare(Raw(psf, 12), Raw(capture, 12), None) for _ in range(2))
+    first, second = (prepare(Raw(psf, 12), Raw(capture, 12), background=None) for _ in range(2))
     np.testing.assert_array_equal(psf, kept[0])
     np.testing.assert_array_equal(capture, kept[1])
     np.testing.assert_array_equal(first.capture, second.capture)
@@ -76,7 +78,7 @@ def test_raw_data_are_left_as_they_were():
 def test_colours_keep_their_places_and_sums(psf_sum):
     psf, capture = measured(3), measured(3, seed=12)
     options = Preparation(psf_sum=psf_sum, capture_scale="norm", downsample=2)
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 40, options)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), background=40, options=options)
     light = np.stack([blocks(psf[..., c] - 40.0, 2) for c in range(3)])
     image = np.stack([blocks(capture[..., c] - 40.0, 2) for c in range(3)])
     sums = light.sum(axis=(1, 2), keepdims=True)
@@ -87,18 +89,28 @@ def test_colours_keep_their_places_and_sums(psf_sum):
 
 def test_one_psf_for_all_channels():
     psf, capture = measured(3), measured(3, seed=12)
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 0, Preparation(psf_channels="mean"))
+    found = prepare(
+        Raw(psf, 12), Raw(capture, 12), background=0, options=Preparation(psf_channels="mean")
+    )
     mean = psf.astype(float).mean(axis=2)
     np.testing.assert_allclose(found.psf, unit_sum(mean)[None], rtol=1e-5)
     assert found.capture.shape == (3, ROWS, COLUMNS)
     grey = prepare(Raw(psf[..., 0], 12), Raw(capture, 12))
     assert grey.psf.shape == (1, ROWS, COLUMNS) and grey.capture.shape[0] == 3
-    averaged = prepare(Raw(psf, 12), Raw(capture[..., 0], 12), 0, Preparation(psf_channels="mean"))
+    averaged = prepare(
+        Raw(psf, 12),
+        Raw(capture[..., 0], 12),
+        background=0,
+        options=Preparation(psf_channels="mean"),
+    )
     np.testing.assert_array_equal(averaged.psf, found.psf)
     with pytest.raises(MeasurementError, match="average the PSF's with `psf_channels='mean'`"):
         prepare(Raw(psf, 12), Raw(capture[..., 0], 12))
     advised = prepare(
-        Raw(psf, 12), Raw(capture[..., 0], 12), None, Preparation(psf_channels="mean")
+        Raw(psf, 12),
+        Raw(capture[..., 0], 12),
+        background=None,
+        options=Preparation(psf_channels="mean"),
     )
     assert list(advised.log.capture.level) == [pytest.approx(np.mean(advised.log.psf.level))]
 
@@ -108,7 +120,7 @@ def test_bayer_superpixel_and_blocks_are_plain_means():
     options = Preparation(
         bayer="GRBG", demosaicing="superpixel", downsample=3, capture_scale="none"
     )
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 40, options)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), background=40, options=options)
     image = (capture - 40.0) / 4095
     red, blue = image[::2, 1::2], image[1::2, ::2]
     green = (image[::2, ::2] + image[1::2, 1::2]) / 2
@@ -148,7 +160,7 @@ def test_dead_pixels_are_left_out_of_means():
     dead[8:12, 20:24] = True  # a whole block
     capture[dead] = 4000
     options = Preparation(downsample=4, capture_scale="none")
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 0, options, dead=dead)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), background=0, options=options, dead=dead)
     assert np.argwhere(~found.valid).tolist() == [[0, 2, 5]]
     block = capture[4:8, 8:12].astype(float)
     np.testing.assert_allclose(found.capture[0, 1, 2] * 4095, (block.sum() - 4000) / 15, rtol=1e-6)
@@ -163,7 +175,7 @@ def test_means_over_a_random_map_of_dead_pixels():
     capture = measured(seed=12)
     dead = np.random.default_rng(8).random(capture.shape) > 0.5
     options = Preparation(downsample=3, capture_scale="none")
-    found = prepare(Raw(measured(), 12), Raw(capture, 12), 0, options, dead=dead)
+    found = prepare(Raw(measured(), 12), Raw(capture, 12), background=0, options=options, dead=dead)
     assert found.valid.all()
     for y, x in np.ndindex(ROWS // 3, COLUMNS // 3):
         block = np.s_[3 * y : 3 * y + 3, 3 * x : 3 * x + 3]
@@ -174,7 +186,7 @@ def test_means_over_a_random_map_of_dead_pixels():
 def test_odd_sides_are_cropped_centrally():
     psf, capture = measured(shape=(27, 38)), measured(shape=(27, 38), seed=12)
     options = Preparation(downsample=4, capture_scale="none")
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 0, options)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), background=0, options=options)
     expected = blocks(capture[1:25, 1:37].astype(float), 4) / 4095
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5)
     assert found.log.first_pixel == (1, 1) and found.log.cropped_to == (24, 36)
@@ -194,7 +206,10 @@ def test_noise_of_the_corner_sets_the_threshold():
     # A mosaic's colours may differ in level without that being noise.
     psf[::2, ::2] += 0.2
     mosaic = prepare(
-        Raw(psf), Raw(psf), 0, Preparation(bayer="RGGB", noise_threshold=5, corner=(0, 40))
+        Raw(psf),
+        Raw(psf),
+        background=0,
+        options=Preparation(bayer="RGGB", noise_threshold=5, corner=(0, 40)),
     )
     np.testing.assert_allclose(mosaic.log.noise, [0.01], rtol=0.08)
 
@@ -203,7 +218,9 @@ def test_centring_shifts_all_channels_alike():
     psf = np.full((ROWS, COLUMNS, 3), 10, np.uint16)
     psf[18, 20], psf[19, 20, 2] = 3000, 3500
     capture = measured(3, seed=12)
-    found = prepare(Raw(psf, 12), Raw(capture, 12), 10, Preparation(centre="peak"))
+    found = prepare(
+        Raw(psf, 12), Raw(capture, 12), background=10, options=Preparation(centre="peak")
+    )
     assert found.log.centring.shift == (-6, -2)
     assert np.argwhere(found.psf[0]).tolist() == [[12, 18]]
     assert np.argwhere(found.psf[2]).tolist() == [[12, 18], [13, 18]]
@@ -219,9 +236,9 @@ def test_the_log_is_plain_json():
     assert log.psf.pixels_at_maximum == (psf == psf.max()).sum()
 
 
-def refused(message, psf, capture, *arguments, **keywords):
+def refused(message, psf, capture, background=None, options=None, **keywords):
     with pytest.raises(MeasurementError, match=message) as caught:
-        prepare(psf, capture, *arguments, **keywords)
+        prepare(psf, capture, background=background, options=options, **keywords)
     assert "\n" not in str(caught.value)
 
 
@@ -255,7 +272,7 @@ def test_backgrounds_that_do_not_belong():
     refused(message, floats, grey, "corner")
     with pytest.warns(UserWarning, match="whose black may turn grey; a dark frame or a number"):
         log = prepare(floats, grey).log  # each level is its own
-    prepare(floats, grey, 40.0)  # as it advises
+    prepare(floats, grey, background=40.0)  # as it advises
     assert (log.psf.background, log.capture.background) == ("corner", "found with the image")
     refused("background = nan: give a finite number", grey, grey, math.nan)
 
@@ -281,7 +298,7 @@ def blob(shape, pitch):
 def test_psf_of_other_pixels_is_brought_to_the_captures(shape, pitch):
     """Half as large or larger pixels, more or fewer of them: the same PSF on the capture's."""
     options = Preparation(psf_scale=pitch, corner=(0, 2))
-    found = prepare(blob(shape, pitch), Raw(measured(bits=16)), 0, options)
+    found = prepare(blob(shape, pitch), Raw(measured(bits=16)), background=0, options=options)
     whole = [max(n, int(k * pitch)) for n, k in zip((ROWS, COLUMNS), shape, strict=True)]
     assert found.capture.shape == (1, ROWS, COLUMNS) and found.psf.shape == (1, *whole)
     expected = blob(found.psf.shape[1:], 1.0).pixels.astype(float)
@@ -297,7 +314,7 @@ def test_psf_larger_than_the_capture_stays_whole(downsample):
     for row, column in at.T:
         mask[row - 1 : row + 2, column - 1 : column + 2] = 4000
     options = Preparation(psf_scale=0.8, corner=(5, 15), downsample=downsample)
-    found = prepare(Raw(mask), Raw(measured(bits=16)), 0, options)
+    found = prepare(Raw(mask), Raw(measured(bits=16)), background=0, options=options)
     assert found.capture.shape == (1, ROWS // downsample, COLUMNS // downsample)
     assert found.psf.shape == (1, 72 // downsample, 56 // downsample)
     y, x = 0.8 * (at - (np.array([[90], [70]]) - 1) / 2)
@@ -312,11 +329,13 @@ def test_crop_leaves_the_psf_whole():
     psf, capture = Raw(measured(), 12), Raw(measured(seed=12), 12)
     dead = np.zeros((ROWS, COLUMNS), bool)
     dead[4:6, 6:8] = True
-    found, whole = (prepare(psf, capture, 0, o, dead=dead) for o in (options, BLOCKS))
+    found, whole = (
+        prepare(psf, capture, background=0, options=o, dead=dead) for o in (options, BLOCKS)
+    )
     np.testing.assert_array_equal(found.psf, whole.psf)
     same = np.where(found.valid, whole.capture[:, 2:10, 3:18], found.capture)
     np.testing.assert_array_equal(found.capture, same)
     np.testing.assert_array_equal(found.valid, whole.valid[:, 2:10, 3:18])
     assert not found.valid[0, 0, 0]
     with pytest.raises(MeasurementError, match=r"lies outside of the capture of 24×36 pixels"):
-        prepare(psf, capture, 0, Preparation(crop=((0, 25), (0, 36))))
+        prepare(psf, capture, background=0, options=Preparation(crop=((0, 25), (0, 36))))

@@ -178,7 +178,7 @@ def test_opaque_alpha_is_left_out_and_a_transparent_one_refused(tmp_path, channe
 def test_camera_bits_in_sixteen(tmp_path, bits):
     pixels = counts(np.uint16) >> (16 - bits)
     write_tiff(tmp_path / "a.tif", pixels)
-    raw = read_image(tmp_path / "a.tif", bits)
+    raw = read_image(tmp_path / "a.tif", bits=bits)
     same(raw, pixels, "tiff", bits)
     assert raw.full_scale == pixels.max()
 
@@ -229,7 +229,7 @@ def test_bit_depth_that_does_not_hold_the_values(tmp_path):
     write_tiff(path, counts(np.uint16) & 0xFFF0)
     refused(path, "up to 65520, above.*multiples of 16.*divide by 16", bits=12)
     with pytest.raises(CaptureFileError, match=r"bits = 7: give a whole number from 8 to 16"):
-        read_image(path, 7)
+        read_image(path, bits=7)
 
 
 def test_paths_that_are_no_file(tmp_path):

@@ -64,13 +64,14 @@ def sensor():
 
 @pytest.fixture(scope="module")
 def found(sensor):
-    return measure_sensor([sensor.taken(one) for one in TIMES], FULL)
+    return measure_sensor([sensor.taken(one) for one in TIMES], full_scale=FULL)
 
 
 def test_numbers_have_no_bias_and_honest_errors(sensor):
     """Of many measurements of one sensor, with new noise each."""
     every = [
-        measure_sensor([sensor.taken(t, 4, 4) for t in (0.02, 0.1, 0.2)], FULL) for _ in range(30)
+        measure_sensor([sensor.taken(t, 4, 4) for t in (0.02, 0.1, 0.2)], full_scale=FULL)
+        for _ in range(30)
     ]
     for name, truth in (("conversion_gain", GAIN), ("read_noise", READ)):
         errors = np.array([getattr(one, f"{name}_error") for one in every])
@@ -99,7 +100,7 @@ def test_defective_pixels_are_found(found):
 def test_line_of_photon_transfer_is_that_of_numpy(sensor):
     """The pair of two frames of EMVA 1288 in place of sums of squares, and a fit by NumPy."""
     series = [sensor.taken(one, 2, 2) for one in TIMES]
-    found = measure_sensor(series, FULL)
+    found = measure_sensor(series, full_scale=FULL)
     good, points = ~found.defective, []
     for one in series:
         lit, dark = one.frames[:, good].astype(float), one.dark[:, good].astype(float)
@@ -169,17 +170,17 @@ def test_two_sigma_cover_or_the_findings_say_why(simulated):
 
 
 def test_flicker_of_the_lamp_is_no_noise(sensor):
-    found = measure_sensor([sensor.taken(t, 8, 8, flicker=0.05) for t in TIMES], FULL)
+    found = measure_sensor([sensor.taken(t, 8, 8, flicker=0.05) for t in TIMES], full_scale=FULL)
     assert abs(found.conversion_gain - GAIN) < 4 * found.conversion_gain_error
 
 
 def test_exposures_that_are_too_bright_are_left_out(sensor):
     series = [sensor.taken(one) for one in (*TIMES, 0.26, 0.5)]  # 0.9 of full scale, saturated
-    found = measure_sensor(series, FULL)
+    found = measure_sensor(series, full_scale=FULL)
     assert len(found.photon_transfer) == len(TIMES)
     assert abs(found.conversion_gain - GAIN) < 4 * found.conversion_gain_error
     with pytest.raises(MeasurementError, match="over 0.8 of full scale; give a shorter"):
-        measure_sensor(series[-1:], FULL)
+        measure_sensor(series[-1:], full_scale=FULL)
 
 
 def test_corrected_frames_are_even_and_have_the_variance_that_they_say(sensor, found):
@@ -195,7 +196,7 @@ def test_corrected_frames_are_even_and_have_the_variance_that_they_say(sensor, f
 
 
 def test_one_exposure_says_nothing_of_another(sensor):
-    one = measure_sensor([sensor.taken(0.1)], FULL)
+    one = measure_sensor([sensor.taken(0.1)], full_scale=FULL)
     assert not one.dark_rate.any() and not one.dark_rate_error.any()
     assert np.array_equal(one.at(0.1).dark_level, one.dark_level)
     assert abs(one.conversion_gain - GAIN) < 4 * one.conversion_gain_error
@@ -208,7 +209,7 @@ def test_a_mosaic_has_the_mean_response_1_at_each_place(sensor):
     coloured = Sensor()
     coloured.response = coloured.response * colours
     series = [coloured.taken(one) for one in TIMES]
-    found = measure_sensor(series, FULL, mosaic=True)
+    found = measure_sensor(series, full_scale=FULL, mosaic=True)
     for i in (0, 1):
         for j in (0, 1):
             good = ~found.defective[i::2, j::2]
@@ -256,7 +257,7 @@ def test_damaged_files_are_refused_in_a_line(found, tmp_path):
 )
 def test_what_cannot_be_measured_is_refused(sensor, change, message):
     with pytest.raises(MeasurementError, match=message):
-        measure_sensor(change(sensor.taken(0.1)), FULL)
+        measure_sensor(change(sensor.taken(0.1)), full_scale=FULL)
 
 
 def test_frames_of_other_pixels_are_refused(found):
@@ -269,7 +270,7 @@ def test_frames_of_other_pixels_are_refused(found):
 def prepared(sensor, found, options, seen=None, **given):
     """Even light at 80 ms, prepared with the calibration."""
     capture = sensor.raw(0.08) if seen is None else seen
-    return prepare(capture, capture, found.at(0.08), options, **given)
+    return prepare(capture, capture, background=found.at(0.08), options=options, **given)
 
 
 @pytest.mark.parametrize(
@@ -324,4 +325,4 @@ def test_defective_pixels_are_not_valid_in_a_preparation(sensor, found):
 def test_a_preparation_of_other_pixels_is_refused(found, pixels):
     raw = Raw(pixels, bits=12)
     with pytest.raises(MeasurementError, match="same region, binning and pixel format"):
-        prepare(raw, raw, found, Preparation(corner=(1, 4)))
+        prepare(raw, raw, background=found, options=Preparation(corner=(1, 4)))

@@ -47,6 +47,7 @@ def camera_operator(beta, distance, dtype=jnp.float64):
             tc.LenslessCamera(plate, SENSOR, distance).on_grid(kernel_grid(SENSOR.grid, FIELD)),
             wavelength=500 * nm,
             object_distance=200.0,
+            pixel_integration=False,
         )
         for plate in plates
     )

@@ -128,7 +128,7 @@ def captures(noise):
 def choice(seen, cameras, synthesis, variance=None, **known):
     """The word of the solver that is picked, and its reason; it takes the same sums."""
     recording = tc.Recording(seen, rig.imaging_model(cameras), noise_variance=variance, **known)
-    solver, reason = tc.choose_solver(recording, synthesis)
+    solver, reason = tc.choose_solver(recording, synthesis=synthesis)
     np.testing.assert_array_equal(solver.synthesis, synthesis)
     return solver.name, reason
 
@@ -185,7 +185,7 @@ def test_what_a_filter_cannot_leave_out_or_tell_apart():
     method, reason = choice(seen, rig.pair(), PAIR, valid=jnp.ones(seen.shape, bool))
     assert method == "admm_tv" and "not to be trusted" in reason
     planes = rig.imaging_model(rig.pair(), object_distance=[80.0, 100.0])
-    solver, reason = tc.choose_solver(tc.Recording(seen, planes), PAIR)
+    solver, reason = tc.choose_solver(tc.Recording(seen, planes), synthesis=PAIR)
     assert solver.name == "admm_tv" and "several planes" in reason
 
 
@@ -252,11 +252,11 @@ def test_the_chosen_solver_makes_the_image():
     errors = clean.max() * jnp.asarray(np.random.default_rng(6).normal(size=clean.shape))
     cameras = rig.imaging_model(rig.pair())
     recording = tc.Recording(clean + 1e-5 * errors, cameras)
-    solver, reason = tc.choose_solver(recording, PAIR)
+    solver, reason = tc.choose_solver(recording, synthesis=PAIR)
     clear = tc.reconstruct(recording, solver)
     assert clear.method == "wiener" and "contrast" in reason and clear.status == "ok"
     assert rig.correlation(clear.image, rig.picture()) > 0.95
-    solver, reason = tc.choose_solver(tc.Recording(clean + 0.02 * errors, cameras), PAIR)
+    solver, reason = tc.choose_solver(tc.Recording(clean + 0.02 * errors, cameras), synthesis=PAIR)
     assert isinstance(solver, tc.AdmmTV) and "total variation" in reason
     solver, reason = tc.choose_solver(recording)
     assert isinstance(solver, tc.AdmmTV) and "background" in reason

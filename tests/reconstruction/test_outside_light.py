@@ -1,5 +1,6 @@
 """Light from outside of the field: found, named with the field that holds it, and taken in."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -58,16 +59,33 @@ def test_a_scene_beyond_a_given_field_is_said_and_the_advice_gains(solver):
 
 
 @pytest.mark.thorough
-def test_the_field_covers_the_scene_by_default():
+@pytest.mark.parametrize("solver", [tc.AdmmTV(), tc.PlugAndPlay()])
+def test_the_field_covers_the_scene_by_default(solver):
     """And an image of it is a start, also where nothing comes from outside."""
     plane, recording = seen(1.25)
-    result = tc.reconstruct(recording, tc.AdmmTV())
+    result: Any = tc.reconstruct(recording, solver)
     assert "the image has field_shape=" + str(result.image.shape) in result.reason
     assert all(n >= 1.2 * s for n, s in zip(result.image.shape, SHAPE, strict=True))
-    kept = tc.reconstruct(with_field(recording, SHAPE), tc.AdmmTV())
+    kept: Any = tc.reconstruct(with_field(recording, SHAPE), solver)
+    assert "give field_shape=" in kept.reason
     assert likeness(result, plane, SHAPE) > 0.9 > 0.8 > likeness(kept, plane)
-    again = tc.reconstruct(seen(0.7)[1], tc.AdmmTV(iterations=10), start=result.image)
+    inside, short = seen(0.7)[1], dataclasses.replace(solver, iterations=10)
+    again: Any = tc.reconstruct(inside, short, start=result.image)
     assert again.image.shape == result.image.shape
+    within: Any = tc.reconstruct(inside, solver)
+    assert within.image.shape == SHAPE and "outside" not in within.reason
+
+
+@pytest.mark.thorough
+def test_counts_of_a_scene_beyond_the_sensors_field():
+    plane, recording = seen(1.25, snr=100.0)
+    light: Any = recording.captures[0]
+    electrons = np.random.default_rng(2).poisson(np.clip(light / light.mean() * 3000, 0, None))
+    counts = dataclasses.replace(recording, captures=[electrons.astype(float)])
+    result: Any = tc.reconstruct(counts, tc.PoissonTV())
+    assert "the image has field_shape=" + str(result.image.shape) in result.reason
+    kept: Any = tc.reconstruct(with_field(counts, SHAPE), tc.PoissonTV())
+    assert likeness(result, plane, SHAPE) > likeness(kept, plane) + 0.02
 
 
 @pytest.mark.thorough

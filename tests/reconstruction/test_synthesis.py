@@ -39,7 +39,12 @@ def model(phases, distance, beta=BETA):
     """Responses of the paraxial model for t = ∞."""
     masks = [tc.FresnelZoneAperture(beta, phase, width=4.0) for phase in phases]
     cameras = [tc.LenslessCamera(mask, SENSOR, distance) for mask in masks]
-    return np.stack([tc.otf(c, wavelength=WAVELENGTH, model="paraxial") for c in cameras])
+    return np.stack(
+        [
+            tc.otf(c, wavelength=WAVELENGTH, model="paraxial", pixel_integration=False)
+            for c in cameras
+        ]
+    )
 
 
 def scanned(beta=BETA, distance=DISTANCE):
@@ -91,7 +96,12 @@ def test_first_zero_of_the_fringe_scanned_response():
             tc.LenslessCamera(tc.FresnelZoneAperture(BETA, phase, width=4.0), sensor, distance)
             for phase in FOUR
         ]
-        h = np.stack([tc.otf(c, wavelength=WAVELENGTH, model="paraxial")[0] for c in cameras])
+        h = np.stack(
+            [
+                tc.otf(c, wavelength=WAVELENGTH, model="paraxial", pixel_integration=False)[0]
+                for c in cameras
+            ]
+        )
         real, imaginary = np.tensordot(fringe_scanning(1), h, axes=1)
         size, u = np.abs(real + 1j * imaginary), np.asarray(sensor.grid.u)
         near = (u > 5.0) & (u < 18.0)

@@ -18,7 +18,7 @@ def prepared():
     view = simulated.capture(simulated.scene()[1:2], light)[0]
     images = (simulated.counts(light, 3), simulated.counts(view, 10, noise=NOISE))
     psf, capture = (Raw(image.astype(np.uint16), bits=12) for image in images)
-    return prepare(psf, capture, float(simulated.DARK), Preparation())
+    return prepare(psf, capture, background=float(simulated.DARK), options=Preparation())
 
 
 def test_noise_in_counts_of_a_raw_pixel(prepared):

@@ -27,7 +27,9 @@ def test_cells_are_carried_to_their_first_image():
     ends = [(n - 1) / 2 * float(camera.sensor.pitch) for n in field]
     v, u = np.meshgrid(*(np.linspace(-e, e, n) for e, n in zip(ends, field, strict=True)))
     pixels = jnp.asarray(np.stack([v, u], axis=-1).transpose(1, 0, 2))
-    seen = np.asarray(wg.trace(camera, pixels, OBJECT, 1).points)[0, ..., 1::-1]
+    seen = np.asarray(wg.trace(camera, pixels, object_distance=OBJECT, orders=1).points)[
+        0, ..., 1::-1
+    ]
     inside = np.abs(seen - np.asarray(PLANE.centre)) < np.array([43.0, 62.0])
     for axis, place in enumerate((y, x)):
         found = (matrix @ place.ravel()).reshape(field) + float(PLANE.centre[axis])

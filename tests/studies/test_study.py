@@ -97,7 +97,11 @@ def test_the_study_of_the_thesis_is_that_of_its_file():
 def test_a_study_of_the_thesis_with_other_numbers():
     target = Target.usaf1951(100.0, 40.0, 64)
     study = tc.studies.superresolution(
-        (50.0, 42.0), (3.0, 4.0), sensor=tc.Sensor((32, 48), 0.05), targets=[target], noise=None
+        betas=(50.0, 42.0),
+        distances=(3.0, 4.0),
+        sensor=tc.Sensor((32, 48), 0.05),
+        targets=[target],
+        noise=None,
     )
     assert [m.name for m in study.methods][:2] == [
         "conventional, d = 3.0 mm",

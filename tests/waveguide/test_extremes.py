@@ -118,7 +118,7 @@ def error(name, dtype):
     """Largest error of the points over all orders, relative to the farthest of them."""
     given = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), EXTREMES[name][0])
     sts, pixel, distance = given
-    rays = wg.trace(sts, jnp.stack(pixel), distance, 4)
+    rays = wg.trace(sts, jnp.stack(pixel), object_distance=distance, orders=4)
     expected = exact(*given)
     found = np.asarray(rays.points[..., :2], float)
     assert np.isfinite(found).all() and np.isfinite(np.asarray(rays.weight)).all()
@@ -154,7 +154,7 @@ def test_no_fringes(dtype):
     """K = 0 matches nothing; the points are finite and dark all the same."""
     given = jax.tree.map(lambda leaf: jnp.asarray(leaf, DTYPES[dtype]), case(weak(0.0)))
     sts, pixel, distance = given
-    rays = wg.trace(sts, jnp.stack(pixel), distance, 2)
+    rays = wg.trace(sts, jnp.stack(pixel), object_distance=distance, orders=2)
     assert (rays.status == RayStatus.NO_BRAGG_MATCH).all()
     assert np.isfinite(rays.points).all() and not rays.weight.any()
     band = trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)

@@ -84,7 +84,7 @@ def random_case(random):
         screen = wg.Screen(film, width, film.index)
         sts = wg.SeeThroughCamera(screen, sensor, focal, random.uniform(2, 20))
         distance = np.exp(random.uniform(np.log(100), np.log(2000)))
-        middle = wg.trace(sts, jnp.zeros(2), distance, 1)
+        middle = wg.trace(sts, jnp.zeros(2), object_distance=distance, orders=1)
         if int(middle.status[0]) != RayStatus.OK:
             continue
         # The bottom hologram: of any length, or of all that matters.

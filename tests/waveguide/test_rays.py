@@ -28,7 +28,7 @@ PLACES = 0.5e-3  # of the digits printed
 
 @pytest.mark.parametrize(("pixel", "wavelength", "angle", *"ABC"), EXACT)
 def test_exact_values(pixel, wavelength, angle, A, B, C):
-    rays = wg.trace(camera(), jnp.asarray(pixel, float), 550.0)
+    rays = wg.trace(camera(), jnp.asarray(pixel, float), object_distance=550.0)
     assert rays.wavelength / nm == pytest.approx(wavelength, abs=PLACES)
     inside = np.degrees(np.arcsin(np.linalg.norm(rays.guided) / 1.5))
     assert inside == pytest.approx(angle, abs=PLACES)
@@ -95,7 +95,7 @@ def test_a_tracer_of_surfaces(tilt):
     random = np.random.default_rng(5)
     pixels = random.uniform(-1.2, 1.2, (40, 2))
     sts = eqx.tree_at(lambda c: c.tilt, camera(), jnp.asarray(tilt))
-    rays = wg.trace(sts, jnp.asarray(pixels), 550.0)
+    rays = wg.trace(sts, jnp.asarray(pixels), object_distance=550.0)
     assert not rays.status.any()
     for order in range(4):
         expected = [traced(pixel, order, 550.0, tilt) for pixel in pixels]
@@ -109,16 +109,18 @@ def test_single_precision_over_the_crop():
     sts = camera()
     pixels = pixel_centres(sts)[np.linspace(0, 439, 23).astype(int), ::73]
     single, plane = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (sts, pixels))
-    points = wg.trace(single, plane, jnp.float32(550.0)).points
+    points = wg.trace(single, plane, object_distance=jnp.float32(550.0)).points
     assert points.dtype == jnp.float32
-    np.testing.assert_allclose(points, wg.trace(sts, pixels, 550.0).points, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        points, wg.trace(sts, pixels, object_distance=550.0).points, rtol=0, atol=1e-4
+    )
 
 
 def test_colours_of_the_crop():
     """489 to 565 nm; the image stands on its head on the sensor, so red is at its lower rows."""
     sts = camera()
     pixels = pixel_centres(sts)[np.linspace(0, 439, 12).astype(int)][:, [0, 219, 439]]
-    nanometres = np.asarray(wg.trace(sts, pixels, 550.0).wavelength / nm)
+    nanometres = np.asarray(wg.trace(sts, pixels, object_distance=550.0).wavelength / nm)
     assert (np.round(nanometres.min()), np.round(nanometres.max())) == (489, 565)
     rows = nanometres.mean(axis=1)
     assert (np.diff(rows) > 0).all()
@@ -131,7 +133,9 @@ def test_places_are_rows_before_columns():
     sts = camera()
     row = pixel_centres(sts)[7, 20:23]
     assert (np.ptp(row[:, 0]), np.ptp(row[:, 1])) == pytest.approx((0, 2 * float(sts.sensor.pitch)))
-    x, y, z = np.moveaxis(np.asarray(wg.trace(sts, row, 550.0, 1).points[0]), -1, 0)
+    x, y, z = np.moveaxis(
+        np.asarray(wg.trace(sts, row, object_distance=550.0, orders=1).points[0]), -1, 0
+    )
     assert np.all(np.diff(x) < -0.1) and np.ptp(y) < 0.1 and np.ptp(z) == 0
 
 
@@ -139,14 +143,14 @@ def test_guided_range():
     """Along x₀ = 0 from −29.87° to 46.27° in air: critical angle and grazing (Eq 5.5)."""
     angles = np.radians(np.array([-29.88, -29.86, 46.26, 46.28]))
     pixels = jnp.stack([-6.0 * np.tan(angles), jnp.zeros(4)], axis=-1)
-    status = np.asarray(wg.trace(camera(), pixels, 550.0, 1).status[0])
+    status = np.asarray(wg.trace(camera(), pixels, object_distance=550.0, orders=1).status[0])
     assert set(status[[1, 2]]) == {RayStatus.OK}
     assert RayStatus.OK not in status[[0, 3]]
     assert RayStatus.NOT_GUIDED in status
 
 
 def numbers(sts, pixel, distance):
-    rays = wg.trace(sts, pixel, distance, 3)
+    rays = wg.trace(sts, pixel, object_distance=distance, orders=3)
     return jnp.sum(rays.points) + 1e5 * jnp.sum(rays.wavelength) + 1e5 * jnp.sum(rays.weight)
 
 
@@ -182,21 +186,27 @@ def test_every_fault_has_a_status():
         532 * nm, 0.0, np.radians(40.0), index=1.5, thickness=0.016, index_modulation=0.02
     )
     low = camera(steep, 1.5)
-    rays = wg.trace(low, jnp.zeros(2), 550.0)
+    rays = wg.trace(low, jnp.zeros(2), object_distance=550.0)
     assert (rays.status == RayStatus.NOT_GUIDED).all()
     thin_glass = camera(hologram(), 1.2)
-    rays = wg.trace(thin_glass, jnp.zeros(2), 550.0)
+    rays = wg.trace(thin_glass, jnp.zeros(2), object_distance=550.0)
     assert (rays.status == RayStatus.EVANESCENT).all()
     short = camera(bottom=wg.Rectangle((20.0, 0.0), (30.0, 10.0)))
-    rays = wg.trace(short, jnp.zeros(2), 550.0)
+    rays = wg.trace(short, jnp.zeros(2), object_distance=550.0)
     # Contacts at 9.1, 27.3, 45.5 and 63.7 mm; the hologram ends at 35.
     off = RayStatus.OFF_HOLOGRAM
     np.testing.assert_array_equal(rays.status, [0, 0, off, off])
     assert not rays.weight[2:].any()
-    aside = wg.trace(camera(), jnp.zeros(2), 550.0, 2, wg.Rectangle((9.0, 0.0), (5.0, 5.0)))
+    aside = wg.trace(
+        camera(),
+        jnp.zeros(2),
+        object_distance=550.0,
+        orders=2,
+        extent=wg.Rectangle((9.0, 0.0), (5.0, 5.0)),
+    )
     np.testing.assert_array_equal(aside.status, [0, RayStatus.MISSED])
     narrow = camera(hologram(CauchyIndex(1.49, 4e-9, (540e-6, 600e-6))), 1.5)
-    none = wg.trace(narrow, jnp.zeros(2), 550.0)
+    none = wg.trace(narrow, jnp.zeros(2), object_distance=550.0)
     assert (none.status == RayStatus.NO_BRAGG_MATCH).all()
     for found in (rays, aside, none):
         assert np.isfinite(found.points).all()
@@ -205,7 +215,9 @@ def test_every_fault_has_a_status():
 
 def test_an_earlier_contact_beside_the_hologram_takes_no_light():
     """A hologram that begins after the first contact: the second is then the first ghost."""
-    whole = wg.trace(camera(), jnp.zeros(2), 550.0)
-    late = wg.trace(camera(bottom=wg.Rectangle((60.0, 0.0), (80.0, 10.0))), jnp.zeros(2), 550.0)
+    whole = wg.trace(camera(), jnp.zeros(2), object_distance=550.0)
+    late = wg.trace(
+        camera(bottom=wg.Rectangle((60.0, 0.0), (80.0, 10.0))), jnp.zeros(2), object_distance=550.0
+    )
     assert late.status[0] == RayStatus.OFF_HOLOGRAM
     np.testing.assert_allclose(late.weight[1:], whole.weight[:-1], rtol=1e-14)

@@ -32,7 +32,7 @@ class TestGhostImages:
     @pytest.mark.thorough
     def test_all_orders_see_the_same_point(self):
         found = self.images()
-        rays = wg.trace(behind(), found.places, OBJECT, ORDERS)
+        rays = wg.trace(behind(), found.places, object_distance=OBJECT, orders=ORDERS)
         points = np.asarray(rays.points)
         for order in range(ORDERS):
             np.testing.assert_allclose(points[order, order], points[0, 0], atol=1e-9)
@@ -46,7 +46,9 @@ class TestGhostImages:
         one point is farther away: d1 + d2 + 2w/n + 3w/(n cos²Θ') = 600 mm along the screen.
         """
         y = np.asarray(self.images().places)[:, 0, 0]
-        apart = np.asarray(wg.trace(behind(), jnp.zeros((1, 2)), OBJECT, 2).points)[:, 0, 1]
+        apart = np.asarray(
+            wg.trace(behind(), jnp.zeros((1, 2)), object_distance=OBJECT, orders=2).points
+        )[:, 0, 1]
         assert apart[1] - apart[0] == pytest.approx(2 * 5 * np.tan(np.deg2rad(61.2)), rel=1e-6)
         assert (apart[1] - apart[0]) / 567 * 1e3 == pytest.approx(32.1, abs=0.1)
         assert (y[1] - y[0]) / 6.5 * 1e3 == pytest.approx(30.38, abs=0.01)
@@ -109,7 +111,9 @@ def traced(camera, scene):
     rows, columns = camera.sensor.shape
     lattice = tc.Grid((fine * (rows - 1) + across, fine * (columns - 1) + across), pitch)
     y, x = np.meshgrid(lattice.y, lattice.x, indexing="ij")
-    rays = wg.trace(camera, jnp.asarray(np.stack([y, x], axis=-1)), OBJECT, ORDERS)
+    rays = wg.trace(
+        camera, jnp.asarray(np.stack([y, x], axis=-1)), object_distance=OBJECT, orders=ORDERS
+    )
     points, weights = np.asarray(rays.points)[..., 1::-1], np.asarray(rays.weight)
     places = (np.arange(across) - (across - 1) / 2) * pitch
     total = np.zeros((rows, columns))
@@ -158,7 +162,9 @@ def test_operator_against_rays_through_every_part_of_the_mask():
     images = ghost_images(camera, field_of(camera, shape, (5, 5)), OBJECT, ORDERS)
     psfs = ghost_psfs(images, shadow)
     fit = low_rank_psf(psfs, camera.sensor.pitch, camera.sensor.shape, shape, tolerance=2e-3)
-    points = wg.trace(camera, field_of(camera, shape, shape), OBJECT, 1).points[0, ..., 1::-1]
+    points = wg.trace(
+        camera, field_of(camera, shape, shape), object_distance=OBJECT, orders=1
+    ).points[0, ..., 1::-1]
     scene = jnp.asarray(blobs(np.asarray(points)))
     expected = traced(camera, blobs)
     assert relative_l2(fit.operator(scene), expected) < 0.01

@@ -91,7 +91,10 @@ def test_the_bragg_wavelength_alone():
     pixels = jnp.asarray(PIXELS)
     narrow = camera(hologram(thickness=16.0, index_modulation=2e-5))
     narrow = eqx.tree_at(lambda c: c.tilt, narrow, jnp.array([0.03, -0.05]))
-    rays, band = wg.trace(narrow, pixels, 550.0, 2), trace_band(narrow, pixels, 550.0, 2, 4)
+    rays, band = (
+        wg.trace(narrow, pixels, object_distance=550.0, orders=2),
+        trace_band(narrow, pixels, 550.0, 2, 4),
+    )
     np.testing.assert_allclose(band.weight, rays.weight, rtol=1e-2)
     spread = np.abs(np.asarray(band.points) - np.asarray(rays.points)[..., None, 1::-1])
     assert spread.max() < 0.02
@@ -102,7 +105,7 @@ def test_holograms_and_critical_angle_cut_the_band():
     """At its edge a hologram keeps a part of a contact's band, and the later contacts their own."""
     pixel = jnp.zeros((1, 2))
     whole = trace_band(camera(), pixel, 550.0, 3, 4)
-    edge = float(wg.trace(camera(), pixel, 550.0, 3).points[1, 0, 1])
+    edge = float(wg.trace(camera(), pixel, object_distance=550.0, orders=3).points[1, 0, 1])
     half = wg.Rectangle((edge / 2, 0.0), (edge, 10.0))
     cut = trace_band(camera(bottom=half), pixel, 550.0, 3, 4)
     np.testing.assert_allclose(cut.weight[0], whole.weight[0], rtol=1e-12)
@@ -122,7 +125,7 @@ def test_a_capture_is_the_sum_over_the_band():
     sts = wg.SeeThroughCamera(wg.Screen(hologram(), 5.0, 1.5), sensor, 6.0, 10.0)
     plane = wg.ObjectPlane((20, 16), 550.0, 160.0, (27.0, 0.0))
     image = np.random.default_rng(4).uniform(size=plane.shape)
-    operator = wg.system_operator(sts, plane, 2, samples=20)
+    operator = wg.system_operator(sts, plane, orders=2, samples=20)
     assert adjoint_error(operator, jax.random.key(1)) < 1e-14
     film, expected, level = hologram(), np.zeros(sensor.shape), 0.0
     pixels = np.asarray(pixel_centres(sts))

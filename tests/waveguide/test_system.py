@@ -32,8 +32,8 @@ def test_every_pixel_is_the_sum_of_its_ghosts(shape):
     """Cells larger and smaller than what a pixel sees: sampled finely in place of overlaps."""
     sts, seen = small(bottom=wg.Rectangle((20.0, 0.0), (40.0, 60.0))), plane(shape)
     image = np.random.default_rng(1).uniform(size=shape)
-    found = np.asarray(wg.system_operator(sts, seen, 3)(jnp.asarray(image)))
-    rays = wg.trace(sts, pixel_centres(sts), 550.0, 3)
+    found = np.asarray(wg.system_operator(sts, seen, orders=3)(jnp.asarray(image)))
+    rays = wg.trace(sts, pixel_centres(sts), object_distance=550.0, orders=3)
     weight = np.asarray(rays.weight)
     size = 70.4e-3 * 560 / 6
     pitch = 120.0 / shape[1]
@@ -104,7 +104,7 @@ def test_every_colour_has_the_ghosts_of_its_wavelength():
     """Of the sensor's middle in thick glass: 2wp/√(n² − p²), p = λ|K_y|/2π, by the Bragg λ."""
     sensor = tc.Sensor((1, 1), 5 * um)
     fine = wg.ObjectPlane((4096, 7), 550.0, 0.21, (75.0, 0.0))
-    operator = wg.system_operator(in_colours(sensor, 20.0), fine, 2)
+    operator = wg.system_operator(in_colours(sensor, 20.0), fine, orders=2)
     assert operator.in_shape == (3, 1, 4096, 7) and operator.out_shape == (3, 1, 1)
     lit = np.asarray(operator.adjoint(jnp.ones((3, 1, 1))))[:, 0].sum(axis=-1)
     y = (np.arange(4096) - 2047.5) * 0.03 + 75
@@ -129,11 +129,11 @@ def test_a_colour_picture_comes_back():
     """Each colour by its own hologram: with that of green in place of all, captures are far off."""
     seen = wg.ObjectPlane((12, 16), 550.0, 120.0, (27.0, 0.0))
     cameras = in_colours()
-    operator = wg.system_operator(cameras, seen, 3)
+    operator = wg.system_operator(cameras, seen, orders=3)
     assert adjoint_error(operator, jax.random.key(1)) < 1e-14
     picture = np.moveaxis(resize(sample_image("astronaut", linear=True), (12, 16)), -1, 0)
     capture = operator(jnp.asarray(picture)[:, None])
-    alone = [wg.system_operator(one, seen, 3)(jnp.asarray(picture)) for one in cameras]
+    alone = [wg.system_operator(one, seen, orders=3)(jnp.asarray(picture)) for one in cameras]
     for n, by_own in enumerate(alone):
         np.testing.assert_allclose(capture[n], by_own[n], atol=1e-14)
     assert relative_l2(alone[1], capture) > 0.01
@@ -146,9 +146,10 @@ def test_planes_add_up():
     """A scene of two planes: the sum of both captures."""
     near = wg.ObjectPlane((12, 16), 300.0, 100.0, (27.0, 10.0))
     images = jnp.asarray(np.random.default_rng(2).uniform(size=(2, 12, 16)))
-    both = wg.system_operator(small(), [plane(), near], 2)(images)
+    both = wg.system_operator(small(), [plane(), near], orders=2)(images)
     each = [
-        wg.system_operator(small(), p, 2)(i) for p, i in zip((plane(), near), images, strict=True)
+        wg.system_operator(small(), p, orders=2)(i)
+        for p, i in zip((plane(), near), images, strict=True)
     ]
     np.testing.assert_allclose(both, sum(each), atol=1e-14)
     with pytest.raises(ValueError, match=r"planes have \[\(12, 16\), \(9, 8\)\] cells; give"):

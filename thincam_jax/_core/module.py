@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,16 +17,23 @@ _MOST = 4  # numbers of an array that are shown, not counted
 _PLAIN = unchecked()
 
 
-class _Sound(type(eqx.Module)):
-    """Classes whose arguments hold no list inside itself: equinox walks through them first."""
+if TYPE_CHECKING:  # a metaclass of one's own hides the arguments of a module
+    _Module = eqx.Module
+else:
 
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        if any(isinstance(one, list | tuple) for one in (*args, *kwargs.values())):
-            refuse_unsound(inspect.signature(cls).parameters, args, kwargs)
-        return super().__call__(*args, **kwargs)
+    class _Sound(type(eqx.Module)):
+        """Classes whose arguments hold no list inside itself: equinox walks through them first."""
+
+        def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+            if any(isinstance(one, list | tuple) for one in (*args, *kwargs.values())):
+                refuse_unsound(inspect.signature(cls).parameters, args, kwargs)
+            return super().__call__(*args, **kwargs)
+
+    class _Module(eqx.Module, metaclass=_Sound):
+        """Module of a class whose arguments are sound."""
 
 
-class AnyRank(eqx.Module, metaclass=_Sound):
+class AnyRank(_Module):
     """Modules whose methods add up arrays of any ranks, whatever JAX's option says."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

@@ -81,7 +81,8 @@ class Once(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         _, _, order = self.make_parser(ctx).parse_args(args=list(args))
         for one in set(order):
-            if order.count(one) > 1 and not (one.multiple or one.is_flag or one.nargs != 1):
+            is_value = one.nargs == 1 and not (one.multiple or getattr(one, "is_flag", False))
+            if is_value and order.count(one) > 1:
                 ctx.fail(f"{one.opts[0]} is given {order.count(one)} times; give it once")
         return super().parse_args(ctx, args)
 

@@ -86,7 +86,7 @@ class Landscape:
 
 @checked
 def landscape_around(
-    problem: DesignProblem, design: Design, count: int = 61, *, at_a_time: int = AT_A_TIME
+    problem: DesignProblem, design: Design, *, count: int = 61, at_a_time: int = AT_A_TIME
 ) -> Landscape:
     """Landscape over the first two free numbers, or the only one, the others as in a design.
 

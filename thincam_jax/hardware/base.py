@@ -11,8 +11,10 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
+from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity, whole
+from thincam_jax.hardware.errors import IncompleteFrame, ProtocolError
 from thincam_jax.measured.bayer import PATTERNS, Pattern, shifted_pattern
 
 Opened = TypeVar("Opened", bound="Device")
@@ -159,6 +161,20 @@ class Camera(Device):
         `Timeout` where no frame came, `IncompleteFrame` where part of it is missing, `Disconnected`
         where the camera has gone. Never a frame exposed before the trigger.
         """
+
+
+def grab(camera: Camera, timeout: float) -> Frame:
+    """Frame of one trigger; IncompleteFrame for None, ProtocolError for what else is no frame."""
+    frame: Any = camera.trigger_and_grab(timeout)
+    name, remedy = str(camera.identity), "mend its driver: see Frame"
+    if frame is None:
+        raise IncompleteFrame(name, "trigger", "its driver returned no frame, but None", remedy)
+    known = isinstance(frame, Frame) and isinstance(frame.pixels, np.ndarray)
+    facts = (frame.number, frame.time, frame.exposure, frame.bit_depth) if known else (None,)
+    if not all(isinstance(fact, int | float | np.number) for fact in facts):
+        cause = f"its driver returned {checks.shown(frame)}, no whole Frame"
+        raise ProtocolError(name, "trigger", cause, remedy)
+    return frame
 
 
 class Stage(Device):

@@ -206,12 +206,11 @@ class Scene(Module):
         lights = [light for light in (spectrum, wavelength) if light is not None]
         if len(lights) != 1:
             raise TypeError("give the light of a Scene once: a Spectrum, or wavelength= in mm")
-        (spectrum,) = lights
         planes = (planes,) if isinstance(planes, ImagePlane) else planes
         if not isinstance(planes, Iterable) or not all(isinstance(p, ImagePlane) for p in planes):
             raise TypeError(f"planes is {checks.shown(planes)}; give an ImagePlane, or several")
         self.planes = tuple(planes)
-        self.spectrum = spectrum if isinstance(spectrum, Spectrum) else Spectrum(spectrum)
+        self.spectrum = lights[0] if isinstance(lights[0], Spectrum) else Spectrum(lights[0])
         if not self.planes:
             raise ValueError("planes is empty; give at least one ImagePlane")
         batches = {plane.image.shape[:-2] for plane in self.planes}

@@ -33,8 +33,8 @@ _LEAST_POINTS, _MOST_POINTS = 3, 21
 def field_operator(
     camera: LenslessCamera,
     light: Spectrum | Number,
-    object_distance: Number = math.inf,
     *,
+    object_distance: Number = math.inf,
     field_shape: Shape,
     tolerance: float = 1e-2,
     model: Model | PsfMethod = "separable",
@@ -72,7 +72,7 @@ def field_operator(
 
     mask = tc.FresnelZoneAperture(25.0, width=1.0)
     camera = tc.LenslessCamera(mask, tc.Sensor((20, 24), 60 * um), distance=6.5)
-    fit = tc.field_operator(camera, 500 * nm, 250.0, field_shape=(16, 20))
+    fit = tc.field_operator(camera, 500 * nm, object_distance=250.0, field_shape=(16, 20))
     capture = fit.operator(jnp.ones((16, 20)))
     print(capture.shape)  # (20, 24)
     ```

@@ -39,13 +39,9 @@ def expose(
     """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
     shape = projected_shape(camera, plane)
     check_memory(camera.sensor, shape, plane.image.shape[:-2])
+    method = as_method(model, pixel_integration)
     convolution = imaging_operator(
-        camera,
-        spectrum,
-        plane.distance,
-        field_shape=shape,
-        model=model,
-        pixel_integration=pixel_integration,
+        camera, spectrum, plane.distance, field_shape=shape, model=method
     )
     return convolution(project(camera, plane, shape))
 

@@ -101,7 +101,7 @@ class PsfMethod:
       pixel of traced numbers.
     - `precision`: "float32" or "float64", in which to compute; the result comes back in the
       camera's own, which is also the default. Double precision needs no setting of JAX's.
-    - `pixel_integration`: average over each pixel, where the function that is called would not.
+    - `pixel_integration`: average over each pixel, unless the function that is called does not.
     - `oversampling`: samples per pixel of the sampled models (odd; default 1, 3 for pixel
       averages, and more where a phase mask's cells are smaller than that), and of the profile that
       "radial" interpolates (by default counted); the others are closed forms and take none.
@@ -128,7 +128,7 @@ class PsfMethod:
 
     model: Model = "separable"
     precision: Precision | None = None
-    pixel_integration: bool = False
+    pixel_integration: bool = True
     oversampling: int | None = None
     mask_shape: tuple[int, int] | None = None
     nodes: int | None = None
@@ -166,14 +166,14 @@ class PsfMethod:
         return self.precision or "float32"
 
 
-def as_method(model: Model | PsfMethod, pixel_integration: bool = False) -> PsfMethod:
-    """The method of that name, or itself, averaged over pixels where either says so."""
+def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMethod:
+    """The method of that name, or itself, averaged over pixels unless either says no."""
     method = model if isinstance(model, PsfMethod) else PsfMethod(model)
-    return replace(method, pixel_integration=True) if pixel_integration else method
+    return method if pixel_integration else replace(method, pixel_integration=False)
 
 
 def psf_method(
-    mask: AbstractMask, grid: Grid, model: Model | PsfMethod, pixel_integration: bool = False
+    mask: AbstractMask, grid: Grid, model: Model | PsfMethod, pixel_integration: bool = True
 ) -> PsfMethod:
     """The method with the defaults for a mask and grid in place of None."""
     method = as_method(model, pixel_integration)

@@ -25,7 +25,7 @@ def harmonic_otf(
     wavelength: Number,
     object_distance: Number = math.inf,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Complex[Array, "v u"]:
     r"""Response of the m-th harmonic of the captures over the phase of a zone aperture, mm².
 
@@ -56,10 +56,11 @@ def harmonic_otf(
         raise ValueError(f"harmonic = {harmonic!r}; give a whole number from 0 on")
     orders = _zone_plate(camera).orders
     steps = max(orders) - min(orders) + int(harmonic) + 1
-    given = (wavelength, object_distance, model, pixel_integration)
+    how = {"wavelength": wavelength, "object_distance": object_distance, "model": model}
+    how["pixel_integration"] = pixel_integration
     turns = np.arange(steps) / steps
     weights = np.exp(-2j * np.pi * harmonic * turns) / steps
-    responses = (_otf(with_phase(camera, turn), *given) for turn in turns)
+    responses = (otf(with_phase(camera, turn), **how) for turn in turns)
     terms = (h * h.dtype.type(w) for h, w in zip(responses, weights, strict=True))
     return functools.reduce(operator.add, terms)
 
@@ -71,7 +72,7 @@ def fringe_scanned_otf(
     wavelength: Number,
     object_distance: Number = math.inf,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Complex[Array, "v u"]:
     r"""Fringe-scanned response of a camera with a Fresnel zone aperture, mm².
 
@@ -96,8 +97,9 @@ def fringe_scanned_otf(
 
     **See also**: `lensless.phase_shift.phase_pair_otf`, `lensless.phase_shift.harmonic_otf`.
     """
-    given = (wavelength, object_distance, model, pixel_integration)
-    h = [_otf(with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
+    how = {"wavelength": wavelength, "object_distance": object_distance, "model": model}
+    how["pixel_integration"] = pixel_integration
+    h = [otf(with_phase(camera, turns), **how) for turns in (0.0, 0.25, 0.5, 0.75)]
     quadrature = h[0] - h[2]
     return (h[3] - h[1]) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
 
@@ -109,7 +111,7 @@ def phase_pair_otf(
     wavelength: Number,
     object_distance: Number = math.inf,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Complex[Array, "v u"]:
     r"""Response of the difference of two captures with the phases 0 and 3π/2, mm².
 
@@ -133,18 +135,9 @@ def phase_pair_otf(
 
     **See also**: `lensless.phase_shift.fringe_scanned_otf`, `lensless.phase_shift.harmonic_otf`.
     """
-    given = (wavelength, object_distance, model, pixel_integration)
-    return _otf(with_phase(camera, 0.0), *given) - _otf(with_phase(camera, 0.75), *given)
-
-
-def _otf(camera, wavelength, object_distance, model, pixel_integration):
-    return otf(
-        camera,
-        wavelength=wavelength,
-        object_distance=object_distance,
-        model=model,
-        pixel_integration=pixel_integration,
-    )
+    how = {"wavelength": wavelength, "object_distance": object_distance, "model": model}
+    how["pixel_integration"] = pixel_integration
+    return otf(with_phase(camera, 0.0), **how) - otf(with_phase(camera, 0.75), **how)
 
 
 def with_phase(camera: LenslessCamera, turns: float) -> LenslessCamera:

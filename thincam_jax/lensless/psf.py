@@ -81,7 +81,7 @@ def psf(
     object_distance: Number = math.inf,
     at: Position | None = None,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Float[Array, "y x"]:
     """Point spread function on the sensor: irradiance relative to the open aperture.
 
@@ -99,8 +99,8 @@ def psf(
       "angular_spectrum" or "rayleigh_sommerfeld"; each is documented in
       `thincam_jax.lensless.propagation`. A `PsfMethod` sets the precision and the samples of a
       model, too.
-    - `pixel_integration`: average over each pixel in place of the value at its centre; of
-      "separable" by as many nodes as its fringes need, at most 320, which leave up to 0.2 % where a
+    - `pixel_integration`: average over each pixel; False is the value at its centre. "separable"
+      averages by as many nodes as its fringes need, at most 320, which leave up to 0.2 % where a
       pixel holds more than 197, pitch·width/(λd). Where these are traced there are 24 nodes, for
       9.5 fringes; `PsfMethod(nodes=)` sets others, `predict_error` tells what they leave.
 
@@ -132,11 +132,11 @@ def psf_about_ray(
     camera: LenslessCamera,
     wavelength: Number,
     object_distance: Number,
-    at: Position,
+    at: Position | None,
     method: PsfMethod,
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
-    path = replace(camera.path(wavelength, object_distance, at), follows=True)
+    path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
     return _evaluate(_psf, camera, path, method)
 
 
@@ -149,14 +149,9 @@ def spectral_psf(
     at: Position | None = None,
 ) -> Float[Array, "y x"]:
     """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
-    camera = camera.on_grid(grid)
-
-    def alone(wavelength: Number) -> Float[Array, "y x"]:
-        if at is not None:
-            return psf_about_ray(camera, wavelength, object_distance, at, method)
-        return psf(camera, wavelength=wavelength, object_distance=object_distance, model=method)
-
-    return functools.reduce(operator.add, (weight * alone(w) for w, weight in light))
+    own = camera.on_grid(grid)
+    parts = (weight * psf_about_ray(own, w, object_distance, at, method) for w, weight in light)
+    return functools.reduce(operator.add, parts)
 
 
 @checked
@@ -167,7 +162,7 @@ def otf(
     object_distance: Number = math.inf,
     at: Position | None = None,
     model: Model | PsfMethod = "separable",
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Complex[Array, "v u"]:
     """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
 
@@ -234,13 +229,8 @@ def mtf(
     if not checks.holds_traced(rho, grid.pitch):
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
-    h = psf(
-        camera,
-        wavelength=wavelength,
-        object_distance=object_distance,
-        model=model,
-        pixel_integration=pixel_integration,
-    )
+    path = camera.path(wavelength, object_distance)
+    h = _evaluate(_psf, camera, path, as_method(model, pixel_integration))
     return _contrast(h, grid, rho)
 
 

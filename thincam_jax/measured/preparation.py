@@ -60,9 +60,9 @@ class _Frame:
 def prepare(
     psf: Raw,
     capture: Raw,
+    *,
     background: Background | None = None,
     options: Preparation | None = None,
-    *,
     psf_background: Background | None = None,
     dead: Bool[np.ndarray, "y x"] | None = None,
 ) -> Prepared:

@@ -65,7 +65,7 @@ class NonlinearWarning(UserWarning):
 
 
 @checked
-def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
+def read_image(path: str | os.PathLike[str], *, bits: int | None = None) -> Raw:
     """Read one image as it is stored, without scaling or gamma.
 
     TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY; PGM and PPM;
@@ -92,7 +92,7 @@ def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[R
     """
     path = Path(path)
     if path.is_dir():
-        return [read_image(one, bits) for one in image_files(path)]
+        return [read_image(one, bits=bits) for one in image_files(path)]
     pages, kind, facts = _decode(path, stack=True)
     return [_raw(page, bits, kind, f"{path}, image {n}", facts) for n, page in enumerate(pages, 1)]
 
@@ -141,7 +141,7 @@ def list_captures(folder: str | os.PathLike[str], bits: int | None = None) -> li
     **Errors**: CaptureFileError, one line, for no such folder, no images in it, a file that cannot
     be read, or an image of another shape than most.
     """
-    shapes = {path: read_image(path, bits).pixels.shape for path in image_files(folder)}
+    shapes = {path: read_image(path, bits=bits).pixels.shape for path in image_files(folder)}
     common, _ = Counter(shapes.values()).most_common(1)[0]
     for path, shape in shapes.items():
         if shape != common:

@@ -147,8 +147,8 @@ class SensorCalibration:
 @checked
 def measure_sensor(
     series: Sequence[ExposedFrames],
-    full_scale: int = 4095,
     *,
+    full_scale: int = 4095,
     outlier: float = 6.0,
     mosaic: bool = False,
 ) -> SensorCalibration:

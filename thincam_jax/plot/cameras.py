@@ -36,13 +36,8 @@ def psf(
     figure = tc.plot.psf(camera, wavelength=500 * nm)
     ```
     """
-    image = psfs.psf(
-        camera,
-        wavelength=wavelength,
-        object_distance=object_distance,
-        model=model,
-        pixel_integration=pixel_integration,
-    )
+    light = {"wavelength": wavelength, "object_distance": object_distance, "model": model}
+    image = psfs.psf(camera, **light, pixel_integration=pixel_integration)
     figure = new_figure(8.5, 3.4)
     draw_psf(figure, np.asarray(image), camera.sensor.grid, _title(camera.mask))
     return figure
@@ -68,17 +63,10 @@ def otf(
 ) -> Figure:
     """Magnitude of a camera's OTF, relative to zero frequency, and the same along v = 0.
 
-    Arguments as of `tc.otf`; here pixel averages are on.
+    Arguments as of `tc.otf`.
     """
-    response = np.asarray(
-        psfs.otf(
-            camera,
-            wavelength=wavelength,
-            object_distance=object_distance,
-            model=model,
-            pixel_integration=pixel_integration,
-        )
-    )
+    light = {"wavelength": wavelength, "object_distance": object_distance, "model": model}
+    response = np.asarray(psfs.otf(camera, **light, pixel_integration=pixel_integration))
     grid = camera.sensor.grid
     u, v = np.asarray(grid.u), np.asarray(grid.v)
     rows, columns = response.shape

@@ -191,21 +191,15 @@ class Explorer:
             f"{psnr(found.image, truth):.1f} dB.",
             *self._about_the_psf(camera, light),
         )
-        pictures = {
-            "capture": _stretched(np.asarray(noisy[0])),
-            "image": align(found.image, truth)[0],
-        }
+        pictures = {"capture": _stretched(np.asarray(noisy[0])), "image": align(found.image, truth)}
         files = {name: _file(image, True) for name, image in pictures.items()}
         return replace(seen, pictures=seen.pictures | files, zero=_zero(camera, light), lines=lines)
 
     def _about_the_psf(self, camera: LenslessCamera, light: dict[str, Any]) -> list[str]:
         """Changes by a cheaper model, and by the angle."""
         tolerance = self.values["tolerance"]
-        chosen = choose_model(
-            camera, tolerance=tolerance * _TOLERANCE.scale, pixel_integration=True, **light
-        )
-        method = PsfMethod(pixel_integration=True)
-        h = psfs.psf(camera, model=method, **light)
+        chosen = choose_model(camera, tolerance=tolerance * _TOLERANCE.scale, **light)
+        h = psfs.psf(camera, **light)
         other = psfs.psf(camera, model=chosen.method, **light)
         found = [
             f"A PSF within {tolerance:.3g} %: model {chosen.method.model}, predicted error "
@@ -213,7 +207,7 @@ class Explorer:
             f"{_change(other, h):.2g}."
         ]
         if any(self.at):
-            off = psfs.psf_about_ray(camera, **light, at=self.at, method=method)
+            off = psfs.psf_about_ray(camera, **light, at=self.at, method=PsfMethod())
             angle = self.values["angle"]
             found.append(
                 f"PSF and transfer function are about the ray at {angle:.3g}°, "
@@ -285,11 +279,8 @@ def _point(numbers: dict[str, Any]) -> tuple[float, Any]:
 def _moving(camera: LenslessCamera, numbers: dict[str, Any]) -> tuple[Any, Any]:
     """The PSF as 256 grey levels, and the OTF along u ≥ 0 at v = 0."""
     light: dict[str, Any] = {name: numbers[name] for name in ("wavelength", "object_distance")}
-    camera, averages = _with_numbers(camera, numbers), PsfMethod(pixel_integration=True)
-    if "angle" in numbers:
-        h = psfs.psf_about_ray(camera, **light, at=_point(numbers), method=averages)
-    else:
-        h = psfs.psf(camera, model=averages, **light)
+    camera, at = _with_numbers(camera, numbers), _point(numbers) if "angle" in numbers else None
+    h = psfs.psf_about_ray(camera, **light, at=at, method=PsfMethod())
     largest = jnp.max(h)
     levels = jnp.round(255 * h / jnp.where(largest > 0, largest, 1)).astype(jnp.uint8)
     # The spectrum along u is that of the sum over y; its phase about the middle pixel.

@@ -79,7 +79,7 @@ def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
         title = name
         if truth is not None and name != truth:
             target = arrays[truth]
-            title += f", {psnr(image, target, float(np.ptp(target))):.1f} dB"
+            title += f", {psnr(image, target, data_range=float(np.ptp(target))):.1f} dB"
         ax.set_title(title, fontsize=9)
     return figure
 

@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
-from thincam_jax import waveguide as wg
 from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.pictures import Reconstructed
@@ -105,7 +104,7 @@ def draw_rays(study: ScreenStudy) -> Figure:
     camera, screen = study.camera, study.camera.screen
     half = 0.43 * camera.sensor.shape[0] * float(camera.sensor.pitch)
     pixels = np.array([[-half, 0.0], [0.0, 0.0], [half, 0.0]])
-    rays = wg.trace(camera, jnp.asarray(pixels), study.plane.distance, study.orders)
+    rays = study.rays(camera, jnp.asarray(pixels))
     d0, d1 = float(camera.focal_distance), float(camera.lens_distance)
     width, start = float(screen.glass_thickness), d0 + d1
     slopes = -pixels[:, 0] / d0

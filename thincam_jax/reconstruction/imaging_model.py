@@ -220,17 +220,11 @@ class Cameras(Module):
         distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
         if not distances.size:
             raise ValueError("object_distance is empty; give one in mm, or one for each plane")
-        kernels = []
+        kernels, method = [], as_method(self.model, self.pixel_integration)
         for camera, wavelength, ratio in zip(self.cameras, self.wavelengths, ratios, strict=True):
             wide = camera.on_grid(kernel_grid(camera.sensor.grid, own_field(field, ratio)))
             planes = [
-                psf(
-                    wide,
-                    wavelength=wavelength,
-                    object_distance=distance,
-                    model=self.model,
-                    pixel_integration=self.pixel_integration,
-                )
+                psf(wide, wavelength=wavelength, object_distance=distance, model=method)
                 for distance in distances
             ]
             kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])

@@ -132,7 +132,7 @@ def reconstruct(
 
 @checked
 def choose_solver(
-    recording: Recording, synthesis: Synthesis | None = None
+    recording: Recording, *, synthesis: Synthesis | None = None
 ) -> tuple[AbstractSolver, str]:
     """Choose `Wiener`, `AdmmTV` or `Fista`, and give the reason in a sentence.
 

@@ -229,7 +229,7 @@ def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> 
         round(float(grid.pitch), 6),
         resolved,
     )
-    return Evaluation(align(image, truth)[0], truth, scores, contrast)
+    return Evaluation(align(image, truth), truth, scores, contrast)
 
 
 def rounded(score: float, digits: int = 3) -> float | None:

@@ -206,7 +206,7 @@ def reconstruct_prepared(
 
     random = np.random.default_rng(0)
     psf, capture = (Raw(random.integers(40, 4000, (40, 48, 1)).astype(np.uint16)) for _ in "ab")
-    prepared = prepare(psf, capture, 40.0)
+    prepared = prepare(psf, capture, background=40.0)
     found = reconstruct_prepared(prepared, tc.AdmmTV(iterations=5), pixel_noise(prepared))
     image = found.image()  # (channel, y, x)
     ```

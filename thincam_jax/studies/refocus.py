@@ -488,5 +488,7 @@ def object_scores(
         None if at is None else round(at, 2),
         None if at is None else round(100 * (at / distance - 1), 2),
         None if peak is None else round(peak.contrast, 4),
-        round(min(float(axial_resolution(camera, distance)) for camera in cameras), 2),
+        round(
+            min(float(axial_resolution(camera, object_distance=distance)) for camera in cameras), 2
+        ),
     )

@@ -90,12 +90,8 @@ def _groups(study: Study, method: Method) -> list[tuple[Exposure, np.ndarray]]:
 
 def _profile(study: Study, exposure: Exposure) -> np.ndarray:
     """The OTF of one exposure along u ≥ 0, v = 0."""
-    response = otf(
-        study.camera(exposure),
-        wavelength=exposure.wavelength,
-        object_distance=study.object_distance,
-        model=study.model,
-        pixel_integration=study.pixel_integration,
-    )
+    light = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
+    how = {"model": study.model, "pixel_integration": study.pixel_integration}
+    response = otf(study.camera(exposure), **light, **how)
     rows, columns = study.sensor.shape
     return np.asarray(response[rows // 2, columns // 2 :])

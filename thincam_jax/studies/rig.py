@@ -189,7 +189,7 @@ def monitor_system(
     **Errors**: ValueError for a screen that guides no light, or none of the monitor's.
     """
     wg.check_screen(camera)
-    system = wg.system_operator(camera, plane, orders, band_samples)
+    system = wg.system_operator(camera, plane, orders=orders, samples=band_samples)
     assert isinstance(system, Sparse)
     brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
     if not brightest > 0:

@@ -117,7 +117,7 @@ class ScreenStudy:
     study = ScreenStudy(
         cameras=(wg.SeeThroughCamera(wg.Screen(film, 5.0, 1.5), sensor, 6.0, 10.0),),
         plane=wg.ObjectPlane((8, 16), distance=550.0, width=120.0, centre=(27.0, 0.0)),
-        targets={"star": siemens_star((8, 16), 4)},
+        targets={"star": siemens_star((8, 16), spokes=4)},
         noise=tc.GaussianNoise(snr_db=40.0),
         solvers={"ridge": tc.Ridge(1.0)},
         models=(ScreenModel("right"), ScreenModel("one image", "no_ghosts")),
@@ -152,10 +152,11 @@ class ScreenStudy:
         """The camera of the middle colour, green."""
         return self.cameras[len(self.cameras) // 2]
 
-    def rays(self, camera: wg.SeeThroughCamera | None = None) -> Rays:
-        """Rays of every pixel and order of a camera; by default of `camera`."""
+    def rays(self, camera: wg.SeeThroughCamera | None = None, pixels: Any = None) -> Rays:
+        """Rays of all orders from every pixel, or some, of a camera; by default of `camera`."""
         camera = camera or self.camera
-        return wg.trace(camera, pixel_centres(camera), self.plane.distance, self.orders)
+        pixels = pixel_centres(camera) if pixels is None else pixels
+        return wg.trace(camera, pixels, object_distance=self.plane.distance, orders=self.orders)
 
     @property
     def wavelengths(self) -> np.ndarray:
@@ -171,8 +172,7 @@ class ScreenStudy:
         pixels = pixel_centres(self.camera)
         step = max(1, min(pixels.shape[:2]) // 20)
         for some in (pixels[::step, ::step], pixels):
-            traced = wg.trace(self.camera, some, self.plane.distance, self.orders)
-            status = np.asarray(traced.status)
+            status = np.asarray(self.rays(pixels=some).status)
             if (status == RayStatus.OK).any():
                 break
         else:

@@ -343,7 +343,7 @@ class CalibrationRun:
             self.measured.matrix,  # pyright: ignore[reportArgumentType]
             self._assumed(),
             study.plane,
-            self.calibration.fitted,
+            parameters=self.calibration.fitted,
             orders=study.orders,
             samples=study.band_samples,
         )
@@ -380,7 +380,9 @@ class CalibrationRun:
         true = there.system(study.models[0])
         captures, solver = there.captured_through(true), list(study.solvers.values())[-1]
         fitted = self.fit.system(plane)
-        assumed = wg.system_operator(self._assumed(), plane, study.orders, study.band_samples)
+        assumed = wg.system_operator(
+            self._assumed(), plane, orders=study.orders, samples=study.band_samples
+        )
         assert isinstance(fitted.operator, Sparse)
         ways: dict[str, Callable[[], SystemMatrix]] = {
             "exact model": partial(SystemMatrix.of, true),

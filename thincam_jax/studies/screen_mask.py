@@ -167,13 +167,15 @@ def first_image(
     edge, scale = np.asarray(plane.centre) + half * around, float(seen_size(camera, plane) / pitch)
     places = np.zeros_like(edge)
     for _ in range(_STEPS):
-        seen = wg.trace(camera, jnp.asarray(places, pitch.dtype), plane.distance, 1).points[0]
+        seen = wg.trace(
+            camera, jnp.asarray(places, pitch.dtype), object_distance=plane.distance, orders=1
+        ).points[0]
         places = places + (np.asarray(seen)[:, 1::-1] - edge) / scale
     rows, columns = np.abs(places).max(axis=0) / float(pitch)
     if not max(rows, columns) < 4096:
         raise ValueError("the object reaches beyond what the screen shows; give a smaller width")
     field = 2 * math.ceil(rows), 2 * math.ceil(columns)
-    rays = wg.trace(camera, field_points(field, pitch), plane.distance, 1)
+    rays = wg.trace(camera, field_points(field, pitch), object_distance=plane.distance, orders=1)
     smeared = SmearedRays(rays.points[..., None, 1::-1], jnp.ones_like(rays.weight))
     size = float(pitch) * float(np.ptp(edge) / np.ptp(places))
     return system_matrix(smeared, plane, size, 1.0), field

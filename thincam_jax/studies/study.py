@@ -364,10 +364,6 @@ class Study:
 
     def psf(self, exposure: Exposure) -> Array:
         """PSF of a point on the axis at the distance of the targets, (y, x)."""
-        return psf(
-            self.camera(exposure),
-            wavelength=exposure.wavelength,
-            object_distance=self.object_distance,
-            model=self.model,
-            pixel_integration=self.pixel_integration,
-        )
+        light = {"wavelength": exposure.wavelength, "object_distance": self.object_distance}
+        how = {"model": self.model, "pixel_integration": self.pixel_integration}
+        return psf(self.camera(exposure), **light, **how)

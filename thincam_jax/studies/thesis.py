@@ -28,9 +28,9 @@ _PUBLISHED = (
 
 @checked
 def superresolution(
+    *,
     betas: tuple[float, float] = (25.0, 21.0),
     distances: tuple[float, float] = (5.0, 6.5),
-    *,
     sensor: Sensor | None = None,
     targets: Sequence[Target] | None = None,
     noise: AbstractNoise | float | int | None = 30.0,

@@ -74,6 +74,7 @@ class GhostDistance:
 def distance_from_ghosts(
     camera: SeeThroughCamera,
     capture: Numbers,
+    *,
     nearest: Number = 200.0,
     farthest: Number = 2000.0,
     orders: int = 4,
@@ -193,7 +194,9 @@ def _search(camera: SeeThroughCamera, ends: tuple[float, float], orders: int) ->
             f"the sensor has {camera.sensor.shape} pixels; give at least {_LEAST} in each direction"
         )
     check_screen(camera)
-    weight = np.asarray(trace(camera, pixel_centres(camera), ends[0], orders).weight, float)
+    weight = np.asarray(
+        trace(camera, pixel_centres(camera), object_distance=ends[0], orders=orders).weight, float
+    )
     lit = weight[0] > 1e-3 * weight[0].max()
     near, far = (_places(camera, end, 2)[0] for end in ends)
     moved = float(np.median(np.linalg.norm(near - far, axis=-1)[lit]))

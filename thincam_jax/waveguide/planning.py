@@ -272,7 +272,7 @@ class _Probe:
     def _lit(self, pixels: np.ndarray, number: int) -> np.ndarray:
         """About how much light of a plane each pixel gets in all orders together, relative."""
         plane = self.planes[number]
-        rays = trace(self.camera, jnp.asarray(pixels), plane.distance, 2)
+        rays = trace(self.camera, jnp.asarray(pixels), object_distance=plane.distance, orders=2)
         first, second = np.asarray(rays.points[..., 1::-1], float)
         order = np.arange(_ORDERS[-1])[:, None]
         points = first + order[..., None] * (second - first)
@@ -478,7 +478,7 @@ def _drawn(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _orders_seen(camera, plane, pixels) -> np.ndarray:
     """Number of orders, for each pixel, beyond which every ghost has left the object."""
-    rays = trace(camera, jnp.asarray(pixels), plane.distance, 2)
+    rays = trace(camera, jnp.asarray(pixels), object_distance=plane.distance, orders=2)
     first, second = np.asarray(rays.points[..., 1::-1], float)
     half = float(plane.pitch) * np.asarray(plane.shape) / 2 + float(seen_size(camera, plane))
     steps = second - first

@@ -62,6 +62,7 @@ class Rays(eqx.Module):
 def trace(
     camera: SeeThroughCamera,
     pixels: Numbers,
+    *,
     object_distance: Number,
     orders: int = 4,
     extent: Rectangle | None = None,

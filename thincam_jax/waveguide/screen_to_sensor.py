@@ -112,7 +112,7 @@ def _ghost_images(
     places, slopes, area = jax.vmap(one, out_axes=(1, 1, 0))(field.reshape(-1, 2))
     depth = -camera.focal_distance * jnp.trace(slopes, axis1=-2, axis2=-1) / 2
     area = area / jnp.linalg.det(slopes - jnp.eye(2, dtype=slopes.dtype))
-    rays = trace(camera, places, distance, orders)
+    rays = trace(camera, places, object_distance=distance, orders=orders)
     weight = jnp.where(rays.status[own, own] == RayStatus.OK, rays.weight[own, own], 0) * area
     shape = (orders, *field.shape[:-1])
     return GhostImages(

@@ -114,13 +114,14 @@ def smeared_rays(
     """`trace_band`, or for None `trace` as one sample at the Bragg wavelength."""
     if samples is not None:
         return trace_band(camera, pixels, plane.distance, orders, samples)
-    rays = trace(camera, pixels, plane.distance, orders)
+    rays = trace(camera, pixels, object_distance=plane.distance, orders=orders)
     return SmearedRays(rays.points[..., None, 1::-1], rays.weight)
 
 
 def system_operator(
     camera: SeeThroughCamera | Sequence[SeeThroughCamera],
     plane: ObjectPlane | Sequence[ObjectPlane],
+    *,
     orders: int = 4,
     samples: int | None = None,
 ) -> Sparse:
@@ -152,7 +153,9 @@ def system_operator(
     sensors of different pixels, and for cells below a 64th of a pixel's field.
     """
     if isinstance(camera, list | tuple):
-        return colour_operator([system_operator(c, plane, orders, samples) for c in camera])
+        return colour_operator(
+            [system_operator(c, plane, orders=orders, samples=samples) for c in camera]
+        )
     if not isinstance(camera, SeeThroughCamera):
         raise TypeError(f"camera is {checks.shown(camera)}; give a waveguide.SeeThroughCamera")
     return planes_operator(camera, plane, (orders, samples))

@@ -195,7 +195,7 @@ def test_the_shipped_file(tmp_path):
     assert shipped.sensor.shape == (440, 440)
     assert {model.mistake for model in shipped.models} >= {"grating", "ghost_index"}
     (camera,) = build_cameras(shipped)
-    status = wg.trace(camera, jnp.zeros(2), 550.0, 4).status
+    status = wg.trace(camera, jnp.zeros(2), object_distance=550.0, orders=4).status
     assert status.tolist() == [0, 0, 0, RayStatus.OFF_HOLOGRAM]  # of the thesis' size
 
 

@@ -242,13 +242,13 @@ def test_colours_are_those_of_the_scene_wherever_the_region_begins(
     virtual = VirtualRig(Coloured(), display_shape=(8, 8))
     drivers = {"camera": (driver, {}), "display": ("sdl", {})}
     plan = scene(WHITE, settings, frames=2, dark_frames=2)
-    with open_rig(drivers, 1.0, virtual) as rig:
+    with open_rig(drivers, 1.0, virtual=virtual) as rig:
         assert acquire(plan, rig, tmp_path / "store").complete
     found = Acquisition.load(tmp_path / "store")
     assert found.settings[0].bayer == pattern
     raw, dark = found.raw(0), found.raw(2)
     options = Preparation(bayer=found.settings[0].bayer, capture_scale="none", corner=(1, 9))
-    ready = prepare(raw, raw, dark, options)
+    ready = prepare(raw, raw, background=dark, options=options)
     counts = raw.full_scale * ready.capture.mean(axis=(1, 2))
     electron = Electronics().scale(settings)[0]
     np.testing.assert_allclose(counts, 0.1 * electron * np.array(Coloured.colours), rtol=0.02)
@@ -260,10 +260,10 @@ def test_a_sensor_is_measured_from_a_store(tmp_path):
     drivers = {"camera": ("usb3_vision", {}), "display": ("sdl", {})}
     given = {"exposures": (0.02, 0.05, 0.1), "frames": 6, "dark_frames": 6}
     plan = scene(WHITE, CameraSettings(0.1, pixel_format="BayerRG12"), **given)
-    with open_rig(drivers, 1.0, virtual) as rig:
+    with open_rig(drivers, 1.0, virtual=virtual) as rig:
         acquire(plan, rig, tmp_path / "store")
     found = Acquisition.load(tmp_path / "store")
-    sensor = measure_sensor(found.exposed(), 2**found.bits - 1, mosaic=True)
+    sensor = measure_sensor(found.exposed(), full_scale=2**found.bits - 1, mosaic=True)
     truth = Electronics()
     electron = truth.scale(found.settings[0])[0]
     assert abs(sensor.conversion_gain - electron) < 4 * sensor.conversion_gain_error

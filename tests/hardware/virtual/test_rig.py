@@ -156,6 +156,20 @@ def rig(**options):
     return VirtualRig(MonitorOptics(system(), 1e6), display_shape=(4, 8), **options)
 
 
+def test_noise_is_that_of_the_step():
+    """Of a plan, whatever was exposed before, as in a resumed run; other steps have other noise."""
+    whole, resumed = rig(), rig()
+    probe = whole.expose(SETTINGS)
+    frames = []
+    for step in range(3):
+        whole.on_step(step)
+        frames.append(whole.expose(SETTINGS))
+    assert all(not np.array_equal(frames[step], frames[step - 1]) for step in range(3))
+    assert not any(np.array_equal(probe, frame) for frame in frames)
+    resumed.on_step(2)
+    np.testing.assert_array_equal(resumed.expose(SETTINGS), frames[2])
+
+
 def test_counts_follow_the_exposure_with_their_noise_and_saturate():
     """Dark level, shot and read noise as the electronics say; full scale where the well is full."""
     electronics = Electronics(full_well=10_000.0, read_noise=20.0, offset=100.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from thincam_jax.imaging.metrics import align, psnr, ssim
+from thincam_jax.imaging.metrics.image import fit_levels
 
 RNG = np.random.default_rng(7)
 GREY = RNG.uniform(size=(23, 40))
@@ -13,14 +14,15 @@ COLOUR = RNG.uniform(size=(23, 40, 3))
 
 
 def test_align_inverts_an_affine_change():
-    aligned, gain, offset = align(4.0 * GREY - 3.0, GREY)
+    aligned, gain, offset = fit_levels(4.0 * GREY - 3.0, GREY)
     assert aligned == pytest.approx(GREY, abs=1e-12)
     assert (float(gain), float(offset)) == pytest.approx((0.25, 0.75))
+    np.testing.assert_array_equal(align(4.0 * GREY - 3.0, GREY), aligned)
 
 
 def test_align_has_one_gain_for_each_channel():
     image = COLOUR * [2.0, 0.5, -1.0] + [0.1, 0.2, 0.3]
-    aligned, gain, offset = align(image, COLOUR)
+    aligned, gain, offset = fit_levels(image, COLOUR)
     assert aligned == pytest.approx(COLOUR, abs=1e-12)
     assert gain == pytest.approx([0.5, 2.0, -1.0])
     assert offset == pytest.approx([-0.05, -0.4, 0.3])
@@ -28,7 +30,7 @@ def test_align_has_one_gain_for_each_channel():
 
 def test_align_is_the_least_squares_line():
     image = GREY + RNG.normal(scale=0.4, size=GREY.shape)
-    aligned, gain, offset = align(image, GREY)
+    aligned, gain, offset = fit_levels(image, GREY)
     slope, intercept = np.polyfit(image.ravel(), GREY.ravel(), 1)
     assert (float(gain), float(offset)) == pytest.approx((slope, intercept))
     assert aligned == pytest.approx(slope * image + intercept)
@@ -36,13 +38,13 @@ def test_align_is_the_least_squares_line():
 
 
 def test_align_of_a_constant_image():
-    aligned, gain, offset = align(np.full(GREY.shape, 0.1), GREY)
+    aligned, gain, offset = fit_levels(np.full(GREY.shape, 0.1), GREY)
     assert float(gain) == 0.0
     assert float(offset) == pytest.approx(GREY.mean())
     assert aligned == pytest.approx(np.full(GREY.shape, GREY.mean()))
     dead = COLOUR.copy()
     dead[..., 1] = 0.0
-    assert align(dead, COLOUR)[1] == pytest.approx([1.0, 0.0, 1.0])
+    assert fit_levels(dead, COLOUR)[1] == pytest.approx([1.0, 0.0, 1.0])
 
 
 def test_psnr_of_a_known_error():
@@ -72,10 +74,10 @@ def test_equal_images():
 
 def test_integer_images_do_not_wrap_round():
     reference = np.full((8, 9), 200, np.uint8)
-    assert psnr(reference + np.uint8(5), reference, 255, aligned=False) == pytest.approx(
+    assert psnr(reference + np.uint8(5), reference, data_range=255, aligned=False) == pytest.approx(
         20 * math.log10(255 / 5)
     )
-    assert psnr(reference, reference + np.uint8(5), 255, aligned=False) == pytest.approx(
+    assert psnr(reference, reference + np.uint8(5), data_range=255, aligned=False) == pytest.approx(
         20 * math.log10(255 / 5)
     )
 

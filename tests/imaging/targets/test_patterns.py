@@ -61,7 +61,7 @@ def ring(image, radius, count):
 @pytest.mark.parametrize("spokes", [9, 36])
 @pytest.mark.parametrize("shape", [(200, 231), (231, 200)])
 def test_every_ring_of_a_star_has_one_period_for_each_spoke(shape, spokes):
-    image = siemens_star(shape, spokes)
+    image = siemens_star(shape, spokes=spokes)
     for radius in (40, 60, 80):
         spectrum = np.fft.rfft(ring(image, radius, 2048)) / 2048
         assert np.argmax(np.abs(spectrum[1:])) + 1 == spokes
@@ -87,7 +87,7 @@ def test_a_wide_sector_of_a_star_is_its_area_average():
     y, x = coordinates(shape)
     radius = np.hypot(y, x)
     zone = (radius > 12) & (radius < 27)
-    assert np.abs(siemens_star(shape, spokes) - expected)[zone].max() < 0.04
+    assert np.abs(siemens_star(shape, spokes=spokes) - expected)[zone].max() < 0.04
 
 
 def test_beyond_nyquist_a_star_is_its_mean():

@@ -108,8 +108,8 @@ def test_total_is_the_area_of_the_bars(shape, layers):
     bars = sum(15 * e.bar**2 for e in usaf1951_elements(layers))
     squares = sum((5 / 32 / 4**layer) ** 2 for layer in range(layers))
     area = (bars + squares) * min(shape) ** 2
-    assert usaf1951(shape, layers).sum() == pytest.approx(area, rel=1e-12)
-    dark = usaf1951(shape, layers, polarity="dark_on_bright")
+    assert usaf1951(shape, layers=layers).sum() == pytest.approx(area, rel=1e-12)
+    dark = usaf1951(shape, layers=layers, polarity="dark_on_bright")
     assert dark.sum() == pytest.approx(shape[0] * shape[1] - area, rel=1e-12)
     assert dark[0, 0] == 1.0
 

@@ -153,7 +153,11 @@ def camera_of(shape=(48, 80), pitch=5.5e-3, distance=6.5, beta=25.0, **mask):
 
 def select(camera, tolerance, object_distance=250.0, **arguments):
     return tc.choose_model(
-        camera, wavelength=500e-6, object_distance=object_distance, tolerance=tolerance, **arguments
+        camera,
+        wavelength=500e-6,
+        object_distance=object_distance,
+        tolerance=tolerance,
+        **{"pixel_integration": False, **arguments},
     )
 
 
@@ -178,7 +182,11 @@ def test_considered_are_the_cheaper_ways():
     assert last.predicted_error == choice.predicted_error
     for prediction in choice.considered:
         alone = tc.predict_error(
-            camera_of(), wavelength=500e-6, object_distance=250.0, model=prediction.method
+            camera_of(),
+            wavelength=500e-6,
+            object_distance=250.0,
+            model=prediction.method,
+            pixel_integration=False,
         )
         assert alone == prediction
 
@@ -220,9 +228,9 @@ def test_an_order_in_focus():
     beta = np.pi / (500e-6 * 20.0)
     camera = camera_of(pitch=0.02, distance=20.0, beta=beta, width=0.5)
     given = {"wavelength": 500e-6, "model": "closed_form"}
-    assert tc.predict_error(camera, **given).predicted_error == math.inf
+    assert tc.predict_error(camera, **given, pixel_integration=False).predicted_error == math.inf
     with pytest.raises(Exception, match="focuses on the sensor"):
-        jax.block_until_ready(tc.psf(camera, **given))
+        jax.block_until_ready(tc.psf(camera, **given, pixel_integration=False))
     choice = select(camera, 1e-4, object_distance=math.inf)
     assert choice.method.model == "separable"
     refused = [p for p in choice.considered if p.method.model == "closed_form"]
@@ -242,7 +250,7 @@ def test_an_order_in_focus():
         },
         False,
     )
-    value = tc.psf(camera, wavelength=500e-6, model=choice.method)
+    value = tc.psf(camera, wavelength=500e-6, model=choice.method, pixel_integration=False)
     assert relative_l2(np.asarray(value), cameras.expected(case)) < 1e-4
 
 
@@ -273,7 +281,10 @@ def test_reasons_name_all_that_is_left_out(distance, pitch, beta, width, toleran
 
     def image(name, precision="float64"):
         given = {"wavelength": 500e-6, "object_distance": 250.0}
-        return np.asarray(tc.psf(camera, model=tc.PsfMethod(name, precision), **given), float)
+        return np.asarray(
+            tc.psf(camera, model=tc.PsfMethod(name, precision), **given, pixel_integration=False),
+            float,
+        )
 
     exact = image("separable")
     rungs = {"geometric": "separable", "paraxial": "closed_form", "closed_form": "separable"}
@@ -332,8 +343,8 @@ def test_samples_off_the_axis_are_not_predicted():
     camera = tc.LenslessCamera(tc.Pinhole(0.5), tc.Sensor((9, 12), 0.05), 5.0)
     light = {"wavelength": 500e-6, "model": "separable"}
     with pytest.raises(ValueError, match="'angular_spectrum'.* on the axis only: leave `at` out"):
-        tc.predict_error(camera, at=(0.1, 0.2), **light)
-    assert tc.predict_error(camera, **light).predicted_error < 1e-5
+        tc.predict_error(camera, at=(0.1, 0.2), **light, pixel_integration=False)
+    assert tc.predict_error(camera, **light, pixel_integration=False).predicted_error < 1e-5
 
 
 def test_predictions_are_of_masks_of_few_terms():
@@ -341,7 +352,9 @@ def test_predictions_are_of_masks_of_few_terms():
     mask = tc.RadialMask([1.0], 0.2)
     camera = tc.LenslessCamera(mask, tc.Sensor((8, 9), 0.1), 5.0)
     with pytest.raises(TypeError, match="of few separable terms") as error:
-        tc.predict_error(camera, wavelength=500e-6, model="angular_spectrum")
+        tc.predict_error(
+            camera, wavelength=500e-6, model="angular_spectrum", pixel_integration=False
+        )
     assert "\n" not in str(error.value)
 
 
@@ -370,8 +383,8 @@ def test_displays_are_chosen_among_the_models_that_hold_pixels():
         tried = {p.method.model for p in choice.considered}
         assert tried.isdisjoint({"paraxial", "closed_form"})
         given = {"wavelength": 500e-6, "object_distance": 250.0}
-        exact = tc.psf(camera, model="separable", **given)
-        found = tc.psf(camera, model=choice.method, **given)
+        exact = tc.psf(camera, model="separable", **given, pixel_integration=False)
+        found = tc.psf(camera, model=choice.method, **given, pixel_integration=False)
         assert relative_l2(np.asarray(found), np.asarray(exact)) <= choice.predicted_error
 
 
@@ -380,15 +393,19 @@ def test_phases_beyond_float32_choose_float64():
     camera = camera_of((48, 80), 1.0, 0.65, 1000.0, width=100.0)
     single = tc.PsfMethod("separable", "float32")
     with pytest.raises(ValueError, match="float32 holds the zones' phase of .* only to"):
-        tc.psf(camera, wavelength=500e-6, object_distance=250.0, model=single)
-    predicted = tc.predict_error(camera, wavelength=500e-6, object_distance=250.0, model=single)
+        tc.psf(
+            camera, wavelength=500e-6, object_distance=250.0, model=single, pixel_integration=False
+        )
+    predicted = tc.predict_error(
+        camera, wavelength=500e-6, object_distance=250.0, model=single, pixel_integration=False
+    )
     assert predicted.predicted_error == math.inf
     assert select(camera, 0.5).method.precision == "float64"
 
 
 def test_numbers_in_other_units_are_refused():
     with pytest.raises(ValueError, match="wavelength = 500 mm is no light: give it in mm, such as"):
-        tc.psf(camera_of(), wavelength=500.0)
+        tc.psf(camera_of(), wavelength=500.0, pixel_integration=False)
     with pytest.raises(ValueError, match=r"tolerance = 5 is relative: give at most 1"):
         select(camera_of(), 5.0)
 
@@ -397,11 +414,11 @@ def test_cost_of_any_mask_before_its_psf_is_computed():
     """With the predicted error where there is one."""
     sensor, light = tc.Sensor((24, 32), 0.04), {"wavelength": 500e-6, "object_distance": 100.0}
     zones = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, width=2.0), sensor, 3.0)
-    cost, error = predict_cost(zones, model="separable", **light)
-    found = tc.predict_error(zones, model="separable", **light)
+    cost, error = predict_cost(zones, model="separable", **light, pixel_integration=False)
+    found = tc.predict_error(zones, model="separable", **light, pixel_integration=False)
     assert (cost, error) == (found.cost, found.predicted_error)
     blank = MaskBlank((12, 12), 0.1, 1.5)
     relief = diffuser(0, blank, correlation_length=0.2, rms_slope=0.01)
     rough = tc.LenslessCamera(relief, sensor, 3.0)
-    cost, error = predict_cost(rough, model="angular_spectrum", **light)
+    cost, error = predict_cost(rough, model="angular_spectrum", **light, pixel_integration=False)
     assert error is None and cost.flops > 1e5 and cost.bytes > 1e4

@@ -44,7 +44,7 @@ def psf(name, distance, wavelength, shape=SHAPE):
 def psf_of(mask, distance, wavelength, shape):
     camera = tc.LenslessCamera(mask, tc.Sensor(shape, PITCH), distance)
     method = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(44, 52))
-    return tc.psf(camera, wavelength=wavelength, model=method)
+    return tc.psf(camera, wavelength=wavelength, model=method, pixel_integration=False)
 
 
 def test_near_and_far(name):
@@ -65,14 +65,19 @@ def test_near_and_far(name):
     )
     far = np.abs(rows @ field @ columns.T * (PITCH / 5) ** 2 / (WAVELENGTH * distance)) ** 2
     camera = tc.LenslessCamera(mask_of(name), tc.Sensor(SHAPE, PITCH), distance)
-    choice = tc.choose_model(camera, wavelength=WAVELENGTH, tolerance=1e-3)
+    choice = tc.choose_model(camera, wavelength=WAVELENGTH, tolerance=1e-3, pixel_integration=False)
     # Rings have a model of their own, which meets any tolerance.
     assert choice.meets_tolerance == (name == "rings")
     if name != "rings":
-        off = relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=choice.method), far)
+        off = relative_l2(
+            tc.psf(camera, wavelength=WAVELENGTH, model=choice.method, pixel_integration=False), far
+        )
         assert 0.03 < off < 3 * choice.predicted_error < 12 * off
     wide = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(416, 416))
-    assert relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=wide), far) < 0.02
+    assert (
+        relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=wide, pixel_integration=False), far)
+        < 0.02
+    )
 
 
 def test_short_waves_cast_the_shadow(name):
@@ -81,12 +86,13 @@ def test_short_waves_cast_the_shadow(name):
             tc.LenslessCamera(mask_of(name), tc.Sensor(SHAPE, PITCH), 2.0),
             wavelength=WAVELENGTH,
             model="geometric",
+            pixel_integration=False,
         )
         assert relative_l2(psf(name, 2.0, 1e-10), shadow) < 0.15  # a pixel's point, and its mean
     else:  # its phases have no limit
         with pytest.raises(TypeError, match="has no shadow|does not have"):
             camera = tc.LenslessCamera(mask_of(name), tc.Sensor(SHAPE, PITCH), 2.0)
-            tc.psf(camera, wavelength=WAVELENGTH, model="geometric")
+            tc.psf(camera, wavelength=WAVELENGTH, model="geometric", pixel_integration=False)
 
 
 def test_light_that_passes_arrives_and_the_operator_has_its_adjoint(name):

@@ -14,7 +14,11 @@ def psf_of(beta, distance, model, *, shape=(30, 41), pitch=0.01, t=np.inf, width
     camera = tc.LenslessCamera(
         tc.FresnelZoneAperture(beta, width=width, **mask), tc.Sensor(shape, pitch), distance
     )
-    return np.asarray(tc.psf(camera, wavelength=WAVELENGTH, object_distance=t, model=model))
+    return np.asarray(
+        tc.psf(
+            camera, wavelength=WAVELENGTH, object_distance=t, model=model, pixel_integration=False
+        )
+    )
 
 
 @pytest.mark.parametrize(("distance", "t"), [(6.5, np.inf), (40.0, 250.0), (300.0, 900.0)])

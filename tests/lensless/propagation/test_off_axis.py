@@ -50,7 +50,13 @@ def seen(mask, angle, azimuth, distance, **how):
     tangent = tangents(angle, azimuth)
     camera = tc.LenslessCamera(mask(tuple(DISTANCE * tangent)), SENSOR, DISTANCE)
     at = tangent if distance == INF else (distance + DISTANCE) * tangent
-    h = tc.psf(camera, wavelength=500 * nm, object_distance=distance, at=at, **how)
+    h = tc.psf(
+        camera,
+        wavelength=500 * nm,
+        object_distance=distance,
+        at=at,
+        **{"pixel_integration": False, **how},
+    )
     return np.asarray(h, float)
 
 
@@ -200,9 +206,15 @@ def test_edges_without_a_closed_form_are_sampled(mask, most):
 def test_under_jit_known_cells_are_sampled_as_outside():
     camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
     light = {"wavelength": 500 * nm, "object_distance": 30.0, "at": (0.4, 0.3)}
-    scaled = jax.jit(lambda scale: scale * tc.psf(camera, **light))(2.0)
-    np.testing.assert_allclose(scaled, 2 * tc.psf(camera, **light), rtol=1e-9, atol=1e-12)
-    steep = jax.jit(lambda scale: scale * tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1)))
+    scaled = jax.jit(lambda scale: scale * tc.psf(camera, **light, pixel_integration=False))(2.0)
+    np.testing.assert_allclose(
+        scaled, 2 * tc.psf(camera, **light, pixel_integration=False), rtol=1e-9, atol=1e-12
+    )
+    steep = jax.jit(
+        lambda scale: (
+            scale * tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1), pixel_integration=False)
+        )
+    )
     assert np.all(np.isfinite(steep(2.0)))
 
 
@@ -261,7 +273,11 @@ def test_averages_are_means_over_points_of_a_pixel(pitch, most):
     light = {"wavelength": 500 * nm, "at": tangent}
     found = tc.psf(tc.LenslessCamera(mask, sensor, DISTANCE), pixel_integration=True, **light)
     fine = tc.LenslessCamera(mask, tc.Sensor((480, 640), pitch / 80), DISTANCE)
-    exact = np.asarray(tc.psf(fine, **light)).reshape(6, 80, 8, 80).mean((1, 3))
+    exact = (
+        np.asarray(tc.psf(fine, **light, pixel_integration=False))
+        .reshape(6, 80, 8, 80)
+        .mean((1, 3))
+    )
     assert relative(np.asarray(found), exact) < most
 
 
@@ -275,7 +291,7 @@ def test_averages_follow_the_fringes_of_a_pixel(pitch, shape):
     points = round(9 * pitch * 0.5 / 1.15) // 2 * 2 + 1
     rows, columns = shape
     fine = camera.on_grid(tc.Grid((rows * points, columns * points), pitch * um / points))
-    exact = np.asarray(tc.psf(fine, at=(1.5, 2.0), **light))
+    exact = np.asarray(tc.psf(fine, at=(1.5, 2.0), **light, pixel_integration=False))
     exact = exact.reshape(rows, points, columns, points).mean((1, 3))
     averaged = light | {"pixel_integration": True}
     found = np.asarray(tc.psf(camera, at=(1.5, 2.0), **averaged))
@@ -317,7 +333,13 @@ def camera_of(beta=25.0, distance=6.5, width=2.0, pitch=200 * um):
 
 def psf(at, beta=25.0, distance=6.5, wavelength=500 * nm, object_distance=100.0):
     camera = camera_of(beta, distance)
-    return tc.psf(camera, wavelength=wavelength, object_distance=object_distance, at=at)
+    return tc.psf(
+        camera,
+        wavelength=wavelength,
+        object_distance=object_distance,
+        at=at,
+        pixel_integration=False,
+    )
 
 
 anywhere = jax.jit(lambda at, distance: psf(at, object_distance=distance))
@@ -326,7 +348,9 @@ anywhere = jax.jit(lambda at, distance: psf(at, object_distance=distance))
 @pytest.mark.thorough
 @pytest.mark.parametrize("distance", [INF, 100.0])
 def test_on_the_axis_it_is_the_psf_of_the_axis(distance):
-    expected = tc.psf(camera_of(), wavelength=500 * nm, object_distance=distance)
+    expected = tc.psf(
+        camera_of(), wavelength=500 * nm, object_distance=distance, pixel_integration=False
+    )
     for at in ((0.0, 0.0), (0.0, 1e-9), (1e-9, 1e-9)):
         assert relative(anywhere(jnp.asarray(at), distance), expected) < 1e-6
     assert relative(psf((0.0, 0.0), object_distance=distance), expected) < 1e-12
@@ -340,9 +364,11 @@ def test_cells_are_continuous_at_the_axis_and_have_slopes():
 
     @jax.jit
     def value(x):
-        return jnp.sum(weights * tc.psf(camera, wavelength=500 * nm, at=(0.0, x)))
+        return jnp.sum(
+            weights * tc.psf(camera, wavelength=500 * nm, at=(0.0, x), pixel_integration=False)
+        )
 
-    on_axis = float(jnp.sum(weights * tc.psf(camera, wavelength=500 * nm)))
+    on_axis = float(jnp.sum(weights * tc.psf(camera, wavelength=500 * nm, pixel_integration=False)))
     assert float(value(1e-9)) == pytest.approx(on_axis, rel=1e-6)
     difference = (value(0.2 + 1e-6) - value(0.2 - 1e-6)) / 2e-6
     assert float(jax.grad(value)(0.2)) == pytest.approx(float(difference), rel=1e-5)
@@ -360,7 +386,14 @@ def test_the_shadow_moves_against_the_point():
     camera = tc.LenslessCamera(tc.Pinhole(0.5), tc.Sensor((60, 80), 40 * um), 6.5)
     at = np.array([10.0, -14.0])
     h = np.asarray(
-        tc.psf(camera, wavelength=500 * nm, object_distance=100.0, at=at, model="geometric")
+        tc.psf(
+            camera,
+            wavelength=500 * nm,
+            object_distance=100.0,
+            at=at,
+            model="geometric",
+            pixel_integration=False,
+        )
     )
     y, x = np.asarray(camera.sensor.grid.y), np.asarray(camera.sensor.grid.x)
     middle = np.array([h.sum(1) @ y, h.sum(0) @ x]) / h.sum()
@@ -410,6 +443,7 @@ def test_single_precision(at):
             object_distance=100.0,
             at=at,
             model=tc.PsfMethod("separable", precision),
+            pixel_integration=False,
         )
         for precision in ("float64", "float32")
     )
@@ -435,7 +469,13 @@ def test_light_of_the_open_aperture_is_1():
     """Far inside the shadow, at 20°, by each model."""
     camera = tc.LenslessCamera(tc.Pinhole(3.0), tc.Sensor((5, 6), 20 * um), 2.0)
     for model in ("geometric", "separable", tc.PsfMethod("angular_spectrum", oversampling=5)):
-        h = tc.psf(camera, wavelength=500 * nm, at=(0.0, np.tan(20 * deg)), model=model)
+        h = tc.psf(
+            camera,
+            wavelength=500 * nm,
+            at=(0.0, np.tan(20 * deg)),
+            model=model,
+            pixel_integration=False,
+        )
         np.testing.assert_allclose(np.mean(h), 1.0, atol=0.03)
 
 
@@ -447,14 +487,22 @@ def test_models_of_the_axis_say_so(model):
     with pytest.raises(
         ValueError, match=f"{model!r} is for points on the axis: leave `at` out, or"
     ):
-        tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1), model=model)
+        tc.psf(
+            camera_of(), wavelength=500 * nm, at=(0.0, 0.1), model=model, pixel_integration=False
+        )
 
 
 def test_lenses_off_both_axes_name_the_sampled_model():
     camera = tc.LenslessCamera(tc.LensletArray(5.0, 0.4, (2, 3)), SENSOR, DISTANCE)
     with pytest.raises(TypeError, match=r"on one of its axes only; give at = \(y, 0\) or \(0, x\)"):
-        tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1))
-    h = tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1), model="angular_spectrum")
+        tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1), pixel_integration=False)
+    h = tc.psf(
+        camera,
+        wavelength=500 * nm,
+        at=(0.1, 0.1),
+        model="angular_spectrum",
+        pixel_integration=False,
+    )
     assert np.all(np.isfinite(h))
 
 
@@ -475,16 +523,28 @@ def test_slow_samples_are_told_beforehand(monkeypatch):
 def test_steep_light_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        tc.psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(30 * deg)))
+        tc.psf(
+            camera_of(width=5.632),
+            wavelength=500 * nm,
+            at=(0.0, np.tan(30 * deg)),
+            pixel_integration=False,
+        )
     with pytest.warns(AccuracyWarning, match="at 60° waves of third order"):
-        tc.psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(60 * deg)))
+        tc.psf(
+            camera_of(width=5.632),
+            wavelength=500 * nm,
+            at=(0.0, np.tan(60 * deg)),
+            pixel_integration=False,
+        )
 
 
 def test_zones_that_focus_off_both_axes_are_sampled():
     """Order −1 of β = 62.83 rad/mm² focuses on a sensor at 100 mm; inside jit it is refused."""
     at, given = (0.02, 0.02), {"beta": 62.83, "distance": 100.0, "object_distance": INF}
     sampled = tc.PsfMethod("angular_spectrum", oversampling=61)
-    exact = tc.psf(camera_of(62.83, 100.0), wavelength=500 * nm, at=at, model=sampled)
+    exact = tc.psf(
+        camera_of(62.83, 100.0), wavelength=500 * nm, at=at, model=sampled, pixel_integration=False
+    )
     assert relative(psf(at, **given), exact) < 0.01
     with pytest.raises(Exception, match="an order focuses nearly on the sensor; use 'angular"):
         jax.jit(lambda y: psf((y, 0.02), **given))(0.02)

@@ -16,7 +16,10 @@ MASK = tc.FresnelZoneAperture(200.0, 0.3, width=0.5, centre=(0.02, -0.03))
 
 direct = jax.jit(
     lambda mask, grid, path, **settings: rayleigh_sommerfeld(
-        mask, grid, path, tc.PsfMethod("rayleigh_sommerfeld", **settings)
+        mask,
+        grid,
+        path,
+        tc.PsfMethod("rayleigh_sommerfeld", **{"pixel_integration": False} | settings),
     ),
     static_argnames=("mask_shape", "oversampling", "pixel_integration"),
 )

@@ -28,7 +28,7 @@ MASKS = {
 
 @jax.jit
 def of_all_pairs(mask, grid, path):
-    return separable(mask, grid, path).image()
+    return separable(mask, grid, path, pixel_integration=False).image()
 
 
 def camera_of(mask):

@@ -97,7 +97,9 @@ def test_against_the_transform_of_the_psf():
             tc.Sensor((int(2 * half / pitch), int(2 * half / pitch) + 1), pitch),
             DISTANCE,
         )
-        h = np.asarray(tc.psf(camera, wavelength=WAVELENGTH, object_distance=60.0))
+        h = np.asarray(
+            tc.psf(camera, wavelength=WAVELENGTH, object_distance=60.0, pixel_integration=False)
+        )
         y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in h.shape)
         u = np.linspace(0.0, 20.0, 21)
         waves = [np.cos(2 * np.pi * np.outer(u[: 21 - 4 * i], c)) for i, c in enumerate((y, x))]

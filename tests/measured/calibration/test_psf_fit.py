@@ -169,7 +169,10 @@ def test_model_of_a_synthesis_is_the_sum_of_pictures():
         jnp.asarray(list(weights)), jnp.asarray([[1.0, 0.0], [0.0, -1.0]])
     )
     rigs = [camera(phase=1.0 + phase) for phase in weights]
-    h = [np.asarray(tc.psf(rig, wavelength=500 * nm, object_distance=100.0)) for rig in rigs]
+    h = [
+        np.asarray(tc.psf(rig, wavelength=500 * nm, object_distance=100.0, pixel_integration=False))
+        for rig in rigs
+    ]
     state = problem.FitState(rigs[0], *map(jnp.asarray, (500 * nm, 0.01, 0.2, 3.0)), synthesis)
     image = np.asarray(state.image(False))
     expected = [0.2 + 3 * h[0], -0.2 - 3 * h[1]]
@@ -241,7 +244,7 @@ def test_residuals_follow_a_direct_sum():
     nearness = 0.01 + 0.001 / 3.0
     beta = 30.0 * math.exp(0.01) * ((1 + d * nearness) / 1.03) ** 2
     rig = camera(beta, d, 1.0, (0.05 + 0.5 * 0.02, -0.03 - 0.02))
-    h = tc.psf(rig, wavelength=500 * nm, object_distance=1 / nearness)
+    h = tc.psf(rig, wavelength=500 * nm, object_distance=1 / nearness, pixel_integration=False)
     np.testing.assert_allclose(there.image(False), 0.2 + 3.1 * h, rtol=1e-9, atol=1e-9)
 
 

@@ -87,7 +87,7 @@ def test_the_smear_is_in_the_model():
     """Without it the glass is off by many standard errors, and χ² says so."""
     measured, names = ghosts(0.01), ("glass_thickness", "object_y")
     start = camera(**TRUE | {"glass": 5.0}), plane(centre=CENTRE)
-    fit, without = (fit_screen(measured, *start, names, samples=s) for s in (4, None))
+    fit, without = (fit_screen(measured, *start, parameters=names, samples=s) for s in (4, None))
     truth = {name: VALUES[name] for name in names}
     assert fit.status == "ok" and np.abs(deviations(fit, truth)).max() < 4
     assert without.status == "poor_fit" and np.abs(deviations(without, truth)).max() > 10
@@ -104,7 +104,7 @@ def test_the_smear_is_in_the_model():
     ],
 )
 def test_undetermined_parameters_are_named(names, reason):
-    fit = fit_screen(ghosts(0.05), camera(), plane(), names, samples=None)
+    fit = fit_screen(ghosts(0.05), camera(), plane(), parameters=names, samples=None)
     assert any(reason in line for line in fit.reasons)
 
 
@@ -112,15 +112,15 @@ def test_undetermined_parameters_are_named(names, reason):
 def test_a_plate_that_leans():
     """Found from ghosts within the errors that are claimed; held upright it explains them badly."""
     measured, start = ghosts(0.05, leaning=(0.02, -0.01)), (camera(**TRUE), plane(centre=CENTRE))
-    fit = fit_screen(measured, *start, ("plate_x", "plate_y"))
+    fit = fit_screen(measured, *start, parameters=("plate_x", "plate_y"))
     assert fit.status == "ok"
     assert np.abs(deviations(fit, {"plate_x": 0.02, "plate_y": -0.01})).max() < 4
-    assert fit_screen(measured, *start, ("object_x", "object_y")).status == "poor_fit"
+    assert fit_screen(measured, *start, parameters=("object_x", "object_y")).status == "poor_fit"
 
 
 @pytest.mark.thorough
 def test_another_screen_is_a_poor_fit():
-    fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), ("slant",))
+    fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), parameters=("slant",))
     assert fit.status == "poor_fit"
 
 
@@ -149,7 +149,7 @@ def test_edges_of_holograms_that_cut_bands():
 
     measured = matrix(wg.system_operator(cut(5.0), plane(), samples=4), noise=2e-4)
     names = ("glass_thickness", "object_y")
-    fit = fit_screen(measured, cut(5.05), plane(), names, samples=4)
+    fit = fit_screen(measured, cut(5.05), plane(), parameters=names, samples=4)
     assert np.abs(deviations(fit, {"glass_thickness": 5.0, "object_y": 27.0})).max() < 4
 
 
@@ -183,14 +183,14 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="the sensor has 30 × 22, but the matrix was measured for"):
         fit_screen(measured, camera(pixels=(30, 22)), plane())
     with pytest.raises(ValueError, match="a name in parameters = 'w'"):
-        fit_screen(measured, camera(), plane(), ("w",))
+        fit_screen(measured, camera(), plane(), parameters=("w",))
     with pytest.raises(ValueError, match="give a tuple of different names"):
-        fit_screen(measured, camera(), plane(), ("tilt", "tilt"))
+        fit_screen(measured, camera(), plane(), parameters=("tilt", "tilt"))
     few = GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), 0.1)
     with pytest.raises(ValueError, match="2 measured numbers for 6 unknowns: give more ghosts"):
         fit_screen(few, camera(), plane())
     late = GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.array([4]), 0.1)
     with pytest.raises(ValueError, match="a ghost of order 4, but orders = 4"):
-        fit_screen(late, camera(), plane(), ("slant",))
+        fit_screen(late, camera(), plane(), parameters=("slant",))
     with pytest.raises(ValueError, match="orders = .*; give a whole number"):
         GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.array([0.5]), 0.1)

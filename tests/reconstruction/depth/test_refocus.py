@@ -180,7 +180,7 @@ def on_axis(camera, t, focus):
 @pytest.mark.parametrize("t", [20.0, 45.0, 130.0])
 def test_an_axis_point_is_gone_one_resolution_away(t):
     camera = rig.cameras()[0]
-    step = float(axial_resolution(camera, t)) / 40  # where defocus is linear in t
+    step = float(axial_resolution(camera, object_distance=t)) / 40  # where defocus is linear in t
     # 40 times the curvature shows at a small step what β shows at the whole one.
     strong = rig.cameras(beta=40 * rig.BETA)[0]
     assert on_axis(strong, t, t + step) == pytest.approx(0.089, abs=0.015)
@@ -193,7 +193,7 @@ def test_reconstructed_point_fades_as_predicted():
     point = np.zeros(rig.FIELD)
     point[23:25, 27:29] = 1.0
     seen = rig.captures(cams, [rig.plane(point, t)], snr_db=100.0, model="geometric")
-    step = float(axial_resolution(cams[0], t))
+    step = float(axial_resolution(cams[0], object_distance=t))
 
     def brightness(focus):
         imaging_model = tc.Cameras(cams, object_distance=focus, field_shape=rig.FIELD)
@@ -215,19 +215,19 @@ def test_only_the_part_of_the_mask_that_the_sensor_sees_counts():
     magnification = 1 + d / t
     squared = ((1.0 / magnification) ** 2 + (1.6 / magnification) ** 2) / 2
     expected = np.pi * t * (t + d) / (10.0 * d * squared)
-    assert float(axial_resolution(wide, t)) == pytest.approx(expected, rel=1e-12)
+    assert float(axial_resolution(wide, object_distance=t)) == pytest.approx(expected, rel=1e-12)
 
 
 def test_arrays_jit_and_slope():
     camera = rig.cameras()[0]
     t = np.array([20.0, 45.0, 150.0])
-    found = jax.jit(axial_resolution)(camera, t)
+    found = jax.jit(axial_resolution)(camera, object_distance=t)
     squared = [np.mean(np.square(halves(distance))) for distance in t]
     closed = np.pi * t * (t + 5.0) / (rig.BETA * 5.0 * np.array(squared))
     np.testing.assert_allclose(found, closed, rtol=1e-12)
 
     def at(x):
-        return axial_resolution(camera, x)
+        return axial_resolution(camera, object_distance=x)
 
     slope = finite_difference(at, np.float64(45.0), np.float64(1.0), 0.5)
     assert float(jax.grad(at)(45.0)) == pytest.approx(float(slope), rel=1e-9)
@@ -237,7 +237,7 @@ def test_another_mask_is_refused():
     sampled = tc.SampledMask(np.ones((8, 8)), 20 * um)
     camera = tc.LenslessCamera(sampled, tc.Sensor((8, 8), 20 * um), 3.0)
     with pytest.raises(TypeError, match="a FresnelZoneAperture only; the camera has a SampledMask"):
-        axial_resolution(camera, 20.0)
+        axial_resolution(camera, object_distance=20.0)
 
 
 def test_distances_are_even_in_one_over_t():

@@ -200,8 +200,8 @@ def opened(config: "CaptureConfig", plan: "AcquisitionPlan") -> Iterator["Rig"]:
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
         try:
-            given = {"turns_phase": config.mask is not None}
-            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual, pictures, **given))
+            given = {"turns_phase": config.mask is not None, "pictures": pictures}
+            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual=virtual, **given))
         except (ValueError, TypeError) as error:
             raise ConfigError(f"options: {error}") from None
         _shown(rig.render, plan.patterns[0])

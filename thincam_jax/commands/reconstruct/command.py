@@ -253,8 +253,8 @@ def examine(
         from thincam_jax.measured import Preparation, read_image
         from thincam_jax.measured.examination import examine as examined
 
-        captures = [read_image(path, bits) for path in files]
-        light = None if psf is None else read_image(psf, bits)
+        captures = [read_image(path, bits=bits) for path in files]
+        light = None if psf is None else read_image(psf, bits=bits)
         found = examined(captures, light, Preparation(bayer=bayer)).findings
     lines = [f"{'severe: ' if one.severe else ''}{one}" for one in found]
     say_result("findings", [vars(one) for one in found], "\n".join(lines) or "nothing found")

@@ -102,7 +102,9 @@ class Inputs:
         psf, (image,) = examined.psf, examined.captures
         assert psf is not None
         known = {"psf_background": self.psf_background, "dead": self.dead}
-        return measured.prepare(psf, image, background, self.sources.preparation, **known)
+        return measured.prepare(
+            psf, image, background=background, options=self.sources.preparation, **known
+        )
 
     def tell(self, findings: Sequence[Finding], strict: bool) -> None:
         """Warn of findings, once of each; MeasurementError for a severe one if `strict`."""
@@ -116,7 +118,7 @@ class Inputs:
         """The background of all images; None of a folder, which has one for each."""
         if not isinstance(given, Path):
             return given
-        return None if given.is_dir() else self._dark(given, bits)
+        return None if given.is_dir() else self._dark(given, bits=bits)
 
     def _read(
         self, files: Sequence[Path], dark: Sequence[Path], bits: int | None, is_psf: bool = False
@@ -128,7 +130,7 @@ class Inputs:
         level = self.psf_background if is_psf else self.background
         if is_psf and level is None and isinstance(self.background, measured.Raw):
             level = self.background if self.background.bits == images[0].bits else None
-        levels: list[Any] = [self._dark(path, bits) for path in dark] or [level] * n
+        levels: list[Any] = [self._dark(path, bits=bits) for path in dark] or [level] * n
         for i, one in enumerate(levels):
             if isinstance(one, measured.Raw):
                 images[i], levels[i] = without_hot_pixels(images[i], one)
@@ -140,7 +142,7 @@ class Inputs:
 
     def _image(self, path: Path, exposure: float | None, bits: int | None) -> measured.Raw:
         """An image with its exposure and the dead pixels of the map, where that has its size."""
-        image = measured.read_image(path, bits)
+        image = measured.read_image(path, bits=bits)
         said, size = image.exposure or exposure, image.pixels.shape[:2]
         if said and exposure and abs(said / exposure - 1) > 0.1:  # more than rounded
             text = (

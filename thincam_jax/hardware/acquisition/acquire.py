@@ -106,6 +106,7 @@ def acquire(
                 if stop.is_set():
                     break
                 step = run.steps[number]
+                rig.on_step(number)
                 frame, facts = run.take(step, settings[step.settings])
                 with run.clock("keep"):
                     recorder.add(number, frame.pixels, facts)

@@ -24,6 +24,7 @@ class Rig(AbstractContextManager["Rig"]):
     - `open_camera`, `open_display`, `open_stage`: open the device, also after it was unplugged,
       such as `functools.partial(open_device, "cameras", "pylon", options)`.
     - `render`: draws a pattern as levels (y, x), uint8, of the display's shape.
+    - `on_step`: called with the number of each step of a plan before its frame is taken.
 
     **Errors**: those of the drivers; devices opened before are closed.
     """
@@ -38,8 +39,9 @@ class Rig(AbstractContextManager["Rig"]):
         open_display: Callable[[], Display],
         render: Callable[[Pattern], np.ndarray],
         open_stage: Callable[[], Stage] | None = None,
+        on_step: Callable[[int], None] = lambda number: None,
     ):
-        self.render = render
+        self.render, self.on_step = render, on_step
         self._openers: dict[str, Any] = {"camera": open_camera, "display": open_display}
         with ExitStack() as opened:
             self.camera = opened.enter_context(open_camera())
@@ -73,9 +75,9 @@ class Rig(AbstractContextManager["Rig"]):
 def open_rig(
     drivers: Mapping[Role, tuple[str, Mapping[str, Any]]],
     pitch: float,
+    *,
     virtual: "VirtualRig | None" = None,
     pictures: Mapping[str, np.ndarray] | None = None,
-    *,
     turns_phase: bool = False,
 ) -> Iterator[Rig]:
     """Open the devices of a rig and home its stage; a context manager.
@@ -115,7 +117,8 @@ def open_rig(
                 pattern = BLACK if pattern == BLACK else WHITE
             return pattern_levels(pattern, rig.display.shape, pitch, pictures)
 
-        rig = Rig(openers["camera"], openers["display"], render, openers.get("stage"))
+        hooks = {} if virtual is None else {"on_step": virtual.on_step}
+        rig = Rig(openers["camera"], openers["display"], render, openers.get("stage"), **hooks)
         stack.enter_context(rig)
         if rig.stage is not None and not rig.stage.homed:
             rig.stage.home()

@@ -18,7 +18,7 @@ from thincam_jax._core.quantity import check_fields, choice, quantity, whole
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.acquisition.rig import Rig, Role
-from thincam_jax.hardware.base import CameraSettings, Frame
+from thincam_jax.hardware.base import CameraSettings, Frame, grab
 from thincam_jax.hardware.errors import (
     Disconnected,
     HardwareError,
@@ -176,7 +176,7 @@ class Taker:
         with self.clock("flush"):
             camera.flush()
         with self.clock("trigger"):
-            frame = camera.trigger_and_grab(self.procedure.timeout)
+            frame = grab(camera, self.procedure.timeout)
         with self.clock("check"):
             # A copy, as drivers reuse their buffers.
             frame = replace(frame, pixels=np.array(frame.pixels))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thincam_jax.hardware.base import Camera, Display
+from thincam_jax.hardware.base import Camera, Display, grab
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
 LONGEST = 0.5  # s, after which a display counts as settled
@@ -145,4 +145,4 @@ class _Rig:
         return time.perf_counter() - start
 
     def _grab(self) -> np.ndarray:
-        return self._camera.trigger_and_grab(self._timeout).pixels.astype(float)
+        return grab(self._camera, self._timeout).pixels.astype(float)

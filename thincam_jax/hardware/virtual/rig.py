@@ -90,8 +90,9 @@ class VirtualRig:
     """The state shared by virtual devices; thread-safe.
 
     `on_show` is for a display, `on_move` for a stage, `expose` for a camera. The noise of an
-    exposure depends on the pattern, the position and the number of earlier exposures of both, so
-    that a resumed run gives the same frames as an uninterrupted one.
+    exposure depends on the pattern, the position and the step of the plan (`on_step`), so that a
+    resumed run gives the same frames as an uninterrupted one; before the first step on the number
+    of earlier exposures of both.
 
     - `response`: s until the display changes to a new pattern.
     - `fiducial`: write a `Fiducial` in place of the image in each frame's corner.
@@ -116,6 +117,7 @@ class VirtualRig:
         self._lock = threading.RLock()
         self._known: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
         self._exposures: Counter[tuple[int, int]] = Counter()
+        self._step: int | None = None
 
     def on_show(self, pattern: UInt8[np.ndarray, "v u"]) -> None:
         """Present a pattern; computes its image in advance."""
@@ -132,6 +134,10 @@ class VirtualRig:
         """Set the stage's position, mm, moving or not."""
         with self._lock:
             self._position = position
+
+    def on_step(self, number: int) -> None:
+        """Begin a step of a plan, by its number."""
+        self._step = number
 
     @property
     def position(self) -> float:
@@ -153,7 +159,8 @@ class VirtualRig:
         if region is not None:
             down = slice(region.top, region.top + region.height)
             electrons = electrons[down, region.left : region.left + region.width]
-        seed = [self.seed, number, state[1] + 2**31, exposure]
+        drawn = [exposure] if self._step is None else [self._step, 1]  # of another length
+        seed = [self.seed, number, state[1] + 2**31, *drawn]
         pixels = self.electronics.counts(electrons, settings, seed)
         if self.fiducial:
             _write_fiducial(pixels, Fiducial(*state, exposure), bits_of(settings))

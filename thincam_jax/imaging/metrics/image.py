@@ -16,6 +16,13 @@ _ROUNDING = 1e-14  # relative to the data range: an error this small is rounding
 
 def align(
     image: Num[ArrayLike, "..."], reference: Num[ArrayLike, "..."]
+) -> Float64[np.ndarray, "y x *channel"]:
+    """The image with the gain and offset that bring it closest to the reference (`fit_levels`)."""
+    return fit_levels(image, reference)[0]
+
+
+def fit_levels(
+    image: Num[ArrayLike, "..."], reference: Num[ArrayLike, "..."]
 ) -> tuple[
     Float64[np.ndarray, "y x *channel"],
     Float64[np.ndarray, " *channel"],
@@ -45,6 +52,7 @@ def align(
 def psnr(
     image: Num[ArrayLike, "..."],
     reference: Num[ArrayLike, "..."],
+    *,
     data_range: float | int = 1.0,
     aligned: bool = True,
 ) -> float:
@@ -59,7 +67,7 @@ def psnr(
     image, reference = _pair(image, reference)
     positive("data_range", data_range, "")
     if aligned:
-        image = align(image, reference)[0]
+        image = align(image, reference)
     if np.sqrt(np.mean((image - reference) ** 2)) <= _ROUNDING * data_range:
         return float("inf")
     ratio = skimage.metrics.peak_signal_noise_ratio(reference, image, data_range=data_range)
@@ -69,6 +77,7 @@ def psnr(
 def ssim(
     image: Num[ArrayLike, "..."],
     reference: Num[ArrayLike, "..."],
+    *,
     data_range: float | int = 1.0,
     aligned: bool = True,
 ) -> float:
@@ -89,7 +98,7 @@ def ssim(
             f"{SSIM_WINDOW} by {SSIM_WINDOW} pixels"
         )
     if aligned:
-        image = align(image, reference)[0]
+        image = align(image, reference)
     similarity = skimage.metrics.structural_similarity(
         reference,
         image,

@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike, Num
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax.imaging.metrics.image import align
+from thincam_jax.imaging.metrics.image import fit_levels
 from thincam_jax.imaging.targets.usaf import POLARITIES, UsafElement, usaf1951, usaf1951_elements
 
 _INNER_LENGTH = 0.8  # of the bars' length, averaged
@@ -112,9 +112,9 @@ def _chart_scale(
     image: np.ndarray, layers: int, pixels_per_chart: float, polarity: str
 ) -> np.ndarray:
     """The image on the scale where the ideal chart's ground is 0 and its bars are 1."""
-    bright = usaf1951(image.shape, layers, pixels_per_chart=pixels_per_chart)
+    bright = usaf1951(image.shape, layers=layers, pixels_per_chart=pixels_per_chart)
     pixels = image.astype(np.float64) * (1 if polarity == "bright_on_dark" else -1)
-    _, gain, _ = align(pixels, bright)
+    _, gain, _ = fit_levels(pixels, bright)
     return bright.mean() + abs(gain) * (pixels - pixels.mean())
 
 

@@ -42,7 +42,7 @@ def slanted_edge(
     return low + (high - low) * covered
 
 
-def siemens_star(shape: tuple[int, int], spokes: int = 36) -> Float64[np.ndarray, "y x"]:
+def siemens_star(shape: tuple[int, int], *, spokes: int = 36) -> Float64[np.ndarray, "y x"]:
     """A star of `spokes` bright sectors (1) and as many dark ones (0) on a dark ground (0).
 
     The disc fills 95 % of the smaller side of `shape` and stands at its centre; the middle of a

@@ -88,6 +88,7 @@ def usaf1951_elements(layers: int = 3, first_group: int = -2) -> tuple[UsafEleme
 
 def usaf1951(
     shape: tuple[int, int],
+    *,
     layers: int = 3,
     polarity: str = "bright_on_dark",
     pixels_per_chart: float | int | None = None,

@@ -78,7 +78,7 @@ def choose_model(
     wavelength: Number,
     object_distance: Number = math.inf,
     tolerance: float,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Selection:
     r"""The cheapest model and precision whose PSF is within `tolerance` of the best one.
 
@@ -150,7 +150,7 @@ def predict_error(
     object_distance: Number = math.inf,
     at: Position | None = None,
     model: Model | PsfMethod,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments as for `psf`, reference as for
     `choose_model`.
@@ -196,7 +196,7 @@ def predict_cost(
     wavelength: Number,
     object_distance: Number = math.inf,
     model: Model | PsfMethod,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
 ) -> tuple[Cost, float | None]:
     """Cost of a PSF before it is computed, and its predicted error; arguments as for `psf`.
 

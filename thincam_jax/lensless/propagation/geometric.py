@@ -18,7 +18,7 @@ from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
 
 def geometric(
-    mask: AbstractMask, grid: Grid, path: LightPath, *, pixel_integration: bool = False
+    mask: AbstractMask, grid: Grid, path: LightPath, *, pixel_integration: bool = True
 ) -> SeparableSum | Float[Array, "y x"]:
     r"""Shadow of the mask, magnified by M (thesis Eq 3.3, corrected): h(r) = |t(r/M)|².
 

@@ -120,7 +120,7 @@ def separable(
     grid: Grid,
     path: LightPath,
     *,
-    pixel_integration: bool = False,
+    pixel_integration: bool = True,
     nodes: int = PIXEL_NODES,
 ) -> SeparableSum:
     r"""PSF of a mask of separable terms: of a zone plate's orders, or of cells.

@@ -40,6 +40,7 @@ class HadamardCaptures:
     - `bits`: bits of the camera; None: any numbers.
     - `exposure`: time, s, if known.
     - `stored_at`: place in the store of each frame of the series; None: the same order.
+    - `frames`: kept in memory, in place of the store at `path`.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class HadamardCaptures:
     bits: int | None
     exposure: float | None
     stored_at: tuple[int, ...] | None = None
+    frames: Real[np.ndarray, "frame y x"] | None = dataclasses.field(default=None, compare=False)
 
     @staticmethod
     def create(
@@ -127,10 +129,13 @@ class HadamardCaptures:
     @property
     def block_rows(self) -> int:
         """Sensor rows of a chunk, best read at once."""
-        return _opened(self.path).frames.chunks[1]
+        in_memory = self.frames is not None
+        return self.sensor_shape[0] if in_memory else _opened(self.path).frames.chunks[1]
 
     def rows(self, start: int, stop: int) -> Real[np.ndarray, "frame y x"]:
         """All frames of some sensor rows, in the order of the series."""
+        if self.frames is not None:
+            return self.frames[:, start:stop]
         frames = _opened(self.path).read(slice(None), slice(start, stop))
         return frames if self.stored_at is None else frames[list(self.stored_at)]
 
@@ -219,23 +224,28 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
 
 
 def simulate_captures(
-    writer: CaptureWriter,
+    writer: CaptureWriter | HadamardSeries,
     operator: AbstractOperator,
     key: Key,
     *,
     noise_std: float = 0.0,
     offset: float = 0.0,
 ) -> HadamardCaptures:
-    """Simulate the captures of a known camera and write them to a store.
+    """Simulate the captures of a known camera and write them to a store, or keep them in memory.
 
+    - `writer`: by `HadamardCaptures.create`; or the series alone, whose frames stay in memory.
     - `operator`: from the cells, 1 is white, to the sensor, in counts (`Scaled` sets the exposure).
     - `noise_std`: standard deviation of white noise, and `offset`: the dark level, in counts. For a
       writer with `bits` the counts are rounded and clipped.
 
     **Errors**: ValueError where the operator's shapes are not those of the cells and the sensor.
     """
-    key = random_key(key)
-    captures = writer.captures
+    key, kept = random_key(key), []
+    if isinstance(writer, HadamardSeries):
+        sensor = checks.shape2d("out_shape", operator.out_shape)
+        store, captures = None, HadamardCaptures(Path(), writer, sensor, None, None)
+    else:
+        store, captures = writer, writer.captures
     series, shape = captures.series, captures.sensor_shape
     given, wanted = (operator.in_shape, operator.out_shape), (series.object_shape, shape)
     if given != wanted:
@@ -249,8 +259,10 @@ def simulate_captures(
         if captures.bits is not None:
             images = np.clip(np.rint(images), 0, 2**captures.bits - 1)
         for number, image in zip(numbers, images, strict=True):
-            writer.write(number, image)
-    writer.close()
+            store.write(number, image) if store else kept.append(image)
+    if store is None:
+        return dataclasses.replace(captures, frames=np.stack(kept))
+    store.close()
     return HadamardCaptures.load(captures.path)
 
 

@@ -130,7 +130,9 @@ class ScreenFit(Module):
 
     def system(self, plane: ObjectPlane) -> Scaled:
         """Matrix for an object at another distance, in the unit of the measured one."""
-        return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
+        return Scaled(
+            system_operator(self.camera, plane, orders=self.orders, samples=self.samples), self.gain
+        )
 
 
 class _State(eqx.Module):
@@ -237,8 +239,8 @@ def fit_screen(
     measured: Matrix | GhostPositions,
     camera: SeeThroughCamera,
     plane: ObjectPlane,
-    parameters: Sequence[str] = DEFAULT,
     *,
+    parameters: Sequence[str] = DEFAULT,
     orders: int = 4,
     samples: int | None = 4,
 ) -> ScreenFit:
@@ -365,7 +367,7 @@ def _smear(problem: _Problem, samples: int | None) -> _Smear:
         return _no_smear()
     camera, distance = problem.start.camera, problem.start.plane.distance
     band = trace_band(camera, problem.pixels, distance, problem.count, samples)
-    rays = trace(camera, problem.pixels, distance, problem.count)
+    rays = trace(camera, problem.pixels, object_distance=distance, orders=problem.count)
     away = band.points - rays.points[..., None, 1::-1]
     mean = jnp.sum(rays.weight) / jnp.sum(band.weight)
     offsets = jnp.where(band.weight[..., None, None] > 0, away, 0)
@@ -413,7 +415,7 @@ def _jacobian(problem: _Problem):
 def _model(state: _State, problem: _Problem):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
     camera, plane = state.camera, state.plane
-    rays = trace(camera, problem.pixels, plane.distance, problem.count)
+    rays = trace(camera, problem.pixels, object_distance=plane.distance, orders=problem.count)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
         centroid = rays.points[..., 1::-1] + jnp.mean(problem.smear.offsets, axis=2)
@@ -447,7 +449,7 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
 
 def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
     """Mean total weight of a pixel's ghosts, which is 1 in `system_operator`."""
-    rays = trace(camera, pixels, plane.distance, orders)
+    rays = trace(camera, pixels, object_distance=plane.distance, orders=orders)
     return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 

@@ -134,7 +134,9 @@ def increasing(distances: Numbers | Sequence[float | int]) -> list[float]:
 
 
 @checked
-def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[Array, "*distance"]:
+def axial_resolution(
+    camera: LenslessCamera, *, object_distance: Numbers
+) -> Float[Array, "*distance"]:
     r"""Change of object distance, mm, that takes an object out of focus.
 
     .. math:: \Delta t = \frac{\pi\, t\,(t+d)}{\beta\, d\, R^2}
