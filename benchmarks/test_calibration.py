@@ -56,7 +56,7 @@ def store(tmp_path_factory):
     series = HadamardSeries(CELLS, display="binary", dark_frames=16)
     writer = HadamardCaptures.create(path, series, SHAPE, bits=12)
     return simulate_captures(
-        writer, true_operator(), jax.random.key(0), deviation=NOISE, offset=100.0
+        writer, true_operator(), jax.random.key(0), noise_std=NOISE, offset=100.0
     )
 
 

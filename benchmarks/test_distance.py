@@ -27,7 +27,7 @@ import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.learn.refocusing.sources import photographs
 from thincam_jax.units import deg, mm, nm, um
-from thincam_jax.waveguide.distance import DistanceStatus, find_distances_of
+from thincam_jax.waveguide.distance import find_distances_of
 
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
 FOLDERS = os.environ.get("THINCAM_FOLDERS", "cc-by-sa/validation").split(",")
@@ -65,7 +65,7 @@ def captured(one, picture, distance, width, snr, rng):
 
 def summary(found, truth):
     """Determined, wrong of these, off by 10 % in all, rms of error over stated, median, mm."""
-    determined = np.array([one.status == DistanceStatus.DETERMINED for one in found])
+    determined = np.array([one.status == "determined" for one in found])
     error = np.array([one.distance for one in found]) - truth
     stated = np.array([one.standard_error for one in found])
     off = abs(error) > 0.1 * truth

@@ -56,7 +56,7 @@ def test_a_screen_calibrated_by_hadamard_patterns_in_memory():
     plane = wg.ObjectPlane(shape=(8, 16), distance=550.0, width=150.0, centre=(27.0, 0.0))
     system = wg.system_operator(camera, plane, orders=4)
     series = calibration.HadamardSeries(plane.shape)
-    captures = calibration.simulate_captures(series, system, key=0, deviation=1e-3)
+    captures = calibration.simulate_captures(series, system, key=0, noise_std=1e-3)
     matrix = calibration.recover_matrix(captures)
     photo = tc.imaging.targets.resize(tc.imaging.targets.sample_image("camera"), plane.shape)
     recording = tc.Recording(system(jnp.asarray(photo)), matrix, noise_variance=1e-6)

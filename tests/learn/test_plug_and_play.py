@@ -279,7 +279,7 @@ def test_start_callback_and_status():
     assert 5 < bright.iterations < 10 and misfits[-1] < 10 < misfits[-2] < misfits[5]
     broken = tc.PlugAndPlay(lambda image, sigma: image * jnp.nan, iterations=3)
     result = tc.reconstruct(seen, broken)
-    assert result.ending == "non_finite" and bool(jnp.isfinite(result.image).all())
+    assert result.status == "non_finite" and bool(jnp.isfinite(result.image).all())
     dark = tc.Recording(jnp.zeros(SENSOR), operator(), noise_variance=SIGMA**2)
     assert float(jnp.abs(tc.reconstruct(dark, solver).image).max()) == 0
 

@@ -28,7 +28,11 @@ def series():
     """Repeated merges of new frames: (repetition, y, x) of rate and variance."""
     random = np.random.default_rng(5)
     found = [merge_exposures([taken(t, random) for t in TIMES], FULL) for _ in range(20)]
-    return np.stack([one.rate for one in found]), np.stack([one.variance for one in found]), found
+    return (
+        np.stack([one.rate for one in found]),
+        np.stack([one.noise_variance for one in found]),
+        found,
+    )
 
 
 def test_without_bias_and_with_the_variance_that_it_says(series):
@@ -100,7 +104,7 @@ def test_one_exposure_is_the_mean_of_its_frames():
 def test_no_light_gives_no_light():
     one = taken(0.2, np.random.default_rng(9), scene=0.0 * SCENE)
     merged = merge_exposures([one, taken(0.02, np.random.default_rng(10), scene=0.0 * SCENE)], FULL)
-    assert abs(np.mean(merged.rate / np.sqrt(merged.variance))) < 0.05
+    assert abs(np.mean(merged.rate / np.sqrt(merged.noise_variance))) < 0.05
     assert merged.valid.all() and merged.gain < 2
 
 

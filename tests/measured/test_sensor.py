@@ -284,11 +284,11 @@ def prepared(sensor, found, options, seen=None, **given):
 )
 def test_a_preparation_is_even_and_has_the_variance_that_it_says(sensor, found, options):
     ready = prepared(sensor, found, options)
-    assert ready.variance is not None and ready.variance.shape == ready.capture.shape
+    assert ready.noise_variance is not None and ready.noise_variance.shape == ready.capture.shape
     z = ready.capture - GAIN * LIGHT * 0.08 / FULL / ready.log.capture_divisor
-    z = z[ready.valid] / np.sqrt(ready.variance[ready.valid])
+    z = z[ready.valid] / np.sqrt(ready.noise_variance[ready.valid])
     assert abs(z.mean()) < 0.12 and abs(np.mean(z**2) - 1) < 0.12
-    assert np.array_equal(np.isfinite(ready.variance), ready.valid)
+    assert np.array_equal(np.isfinite(ready.noise_variance), ready.valid)
     raw = np.sqrt(GAIN**2 * READ**2 + GAIN**2 * (LIGHT + 150) * 0.08)
     assert ready.log.capture.noise == pytest.approx(raw, rel=0.05)  # of an uneven response
     noise = pixel_noise(ready)
@@ -306,9 +306,9 @@ def test_superpixels_have_the_variance_of_their_samples(sensor, found):
     z = ready.capture - GAIN * LIGHT * 0.08 / FULL / ready.log.capture_divisor
     for channel in range(3):
         here = ready.valid[channel]
-        squares = z[channel][here] ** 2 / ready.variance[channel][here]
+        squares = z[channel][here] ** 2 / ready.noise_variance[channel][here]
         assert abs(np.mean(squares) - 1) < 0.15
-    mean = [np.mean(one[np.isfinite(one)]) for one in ready.variance]
+    mean = [np.mean(one[np.isfinite(one)]) for one in ready.noise_variance]
     assert mean[1] == pytest.approx(mean[0] / 2, rel=0.1)
 
 

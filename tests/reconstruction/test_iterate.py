@@ -14,6 +14,7 @@ from thincam_jax.reconstruction.iterate import (
     Schedule,
     iterate,
 )
+from thincam_jax.reconstruction.result import Reconstruction
 
 
 class Walk(AbstractMethod[Float[Array, ""]]):
@@ -184,3 +185,15 @@ def test_a_batch_is_judged_by_its_sum():
     outcome = iterate(method, jnp.full((2, 1, 1, 1, 1), 9.0), Schedule(3, 0.0, check_every=1))
     assert [p.objective for p in outcome.history] == [18, 12, 9, 15]
     np.testing.assert_array_equal(outcome.image.ravel(), [3, 6])
+
+
+def test_iterations_exhausted_read_as_what_is_left_to_gain():
+    steps = tuple(Progress(n, v, math.nan, math.nan) for n, v in ((0, 9.0), (10, 5.0), (20, 4.9)))
+    known = {"ended": "iterations_exhausted", "iterations": 20}
+    image = jnp.ones((3, 4))
+    seen = Reconstruction(image, None, history=steps, **known)
+    told = "stopped after 20 iterations; the objective still fell by 0.2 % an iteration"
+    assert (seen.status, seen.ending) == ("iterations_exhausted", told)
+    assert Reconstruction(image, None, **known).ending == "stopped after 20 iterations"
+    assert Reconstruction(image, None).ending == "ok"
+    assert Reconstruction(jnp.nan * image, None, **known).ending == "non finite after 20 iterations"

@@ -27,12 +27,11 @@ from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.space import DesignSpace, active_limits
+from thincam_jax.reconstruction.iterate import Status
 
 Solver = Literal["bfgs", "lbfgsb"]
 # Optima closer than this in the unit cube are one.
 SEPARATION = 0.02
-
-Status = Literal["converged", "iterations_exhausted", "non_finite"]
 
 
 @checked

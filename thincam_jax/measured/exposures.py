@@ -60,20 +60,20 @@ class ExposedFrames:
 class MergedExposures:
     """Result of `merge_exposures`.
 
-    - `rate`, `variance`: a pixel's signal and its variance, counts/s and (counts/s)². The variance
-      is infinite where every exposure is saturated; the rate is then a lower bound, a full pixel's.
+    - `rate`, `noise_variance`: a pixel's signal, counts/s, and its variance, (counts/s)², infinite
+      where every exposure is saturated; the rate is then a lower bound, a full pixel's.
     - `gain`: g, counts per electron. `dark_variance`: s² of each exposure, counts².
     """
 
     rate: Float[np.ndarray, "y x"]
-    variance: Float[np.ndarray, "y x"]
+    noise_variance: Float[np.ndarray, "y x"]
     gain: float
     dark_variance: tuple[float, ...]
 
     @property
     def valid(self) -> Bool[np.ndarray, "y x"]:
         """Pixels that some exposure did not saturate."""
-        return np.isfinite(self.variance)
+        return np.isfinite(self.noise_variance)
 
 
 @checked
@@ -97,7 +97,7 @@ def merge_exposures(exposures: Sequence[ExposedFrames], full_scale: int = 4095) 
     ...     frames = np.clip(np.rint(light + noise[:4]), 0, 4095)
     ...     return ExposedFrames(exposure, frames, np.rint(noise[4:]))
     >>> merged = merge_exposures([taken(0.05), taken(1.0)])
-    >>> bool(np.all(np.abs(merged.rate - scene) < 5 * np.sqrt(merged.variance)))
+    >>> bool(np.all(np.abs(merged.rate - scene) < 5 * np.sqrt(merged.noise_variance)))
     True
     """
     if not exposures:

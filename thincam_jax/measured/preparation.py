@@ -30,7 +30,7 @@ class Prepared:
     - `capture`: in fractions of full scale divided by `log.capture_divisor`.
     - `valid`: False where the capture is saturated or dead.
     - `log`: numbers of the steps.
-    - `variance`: the capture's, by a sensor's calibration, for independent values before
+    - `noise_variance`: the capture's, by a sensor's calibration, for independent values before
       `downsample`; infinite where not valid.
     """
 
@@ -38,7 +38,7 @@ class Prepared:
     capture: Float32[np.ndarray, "channel y x"]
     valid: Bool[np.ndarray, "channel y x"]
     log: PreparationLog
-    variance: Float32[np.ndarray, "channel y x"] | None = None
+    noise_variance: Float32[np.ndarray, "channel y x"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,7 @@ def history(result: Reconstruction) -> Figure:
     residuals.set(xlabel="iteration", ylabel="relative residual")
     if residuals.lines:
         residuals.legend(frameon=False)
-    objective.set_title(f"{result.method}, {result.status}", fontsize=9)
+    objective.set_title(f"{result.method}, {result.ending.partition(';')[0]}", fontsize=9)
     return figure
 
 

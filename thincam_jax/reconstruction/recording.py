@@ -184,7 +184,7 @@ class Recording(Module):
             self.shaped(outcome.image),
             model.pitch if isinstance(model, Cameras) else None,
             method,
-            ending=outcome.status,
+            ended=outcome.status,
             history=outcome.history,
             iterations=outcome.iterations,
             seconds=outcome.seconds,
@@ -215,10 +215,10 @@ class Recording(Module):
         captures, _ = self._masked_captures()
         return tuple(channel_capture(row, captures, ratios) for row in rows)
 
-    def with_noise(self, variance: Numbers) -> "Recording":
+    def with_noise(self, noise_variance: Numbers) -> "Recording":
         """This recording with another noise variance."""
         none = {"is_leaf": lambda leaf: leaf is None}
-        return eqx.tree_at(lambda recording: recording.noise_variance, self, variance, **none)
+        return eqx.tree_at(lambda recording: recording.noise_variance, self, noise_variance, **none)
 
     def focused(self, object_distance: Numbers | Sequence[Number]) -> "Recording":
         """This recording with its `Cameras` focused on another distance, mm."""

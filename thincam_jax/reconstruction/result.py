@@ -18,8 +18,7 @@ class Reconstruction(Module):
     - `pitch`: distance of its pixels on the object, mm (of each plane); None without cameras.
     - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`, or what
       was noticed when τ was left to a rule.
-    - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
-      callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
+    - `ended`: how an iteration ended, in the words of `status`.
     - `history`: objective and residuals along the way; see `Progress`.
     - `iterations`, `seconds`: done and taken; compilation is part of the time.
     - `tau`: the relative τ used, as given or found; None for methods without.
@@ -32,7 +31,7 @@ class Reconstruction(Module):
     pitch: Float[Array, "*plane"] | None = eqx.field(converter=unchecked("mm"))
     method: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
-    ending: str | None = eqx.field(static=True, default=None)
+    ended: str = eqx.field(static=True, default="ok")
     history: tuple[Progress, ...] = eqx.field(static=True, default=(), repr=False)
     iterations: int = eqx.field(static=True, default=0)
     seconds: float = eqx.field(static=True, default=0.0)
@@ -42,10 +41,26 @@ class Reconstruction(Module):
 
     @property
     def status(self) -> str:
-        """`ending`, or "ok" without one; "non_finite" for NaN or infinity. Unknown inside jit."""
-        if not bool(jnp.isfinite(self.image).all()):
-            return "non_finite"
-        return self.ending or "ok"
+        """Status of the image, unknown inside jit.
+
+        "ok" in closed form; of an iteration "converged", "iterations_exhausted", "stopped" by the
+        callback or "interrupted" by Ctrl-C; "non_finite" for NaN or infinity.
+        """
+        return self.ended if bool(jnp.isfinite(self.image).all()) else "non_finite"
+
+    @property
+    def ending(self) -> str:
+        """The status in a sentence; of iterations exhausted, by how much the last ones gained."""
+        if self.status != "iterations_exhausted":
+            words = self.status.replace("_", " ")
+            return f"{words} after {self.iterations} iterations" if self.iterations else words
+        words = f"stopped after {self.iterations} iterations"
+        if len(self.history) < 3:  # of one compiled program only start and end are known
+            return words
+        last, end = self.history[-2:]
+        fall = (last.objective - end.objective) / abs(last.objective or 1.0)
+        gain = 100 * max(fall, 0.0) / (end.iteration - last.iteration)
+        return f"{words}; the objective still fell by {gain:.2g} % an iteration"
 
     @property
     def has_planes(self) -> bool:

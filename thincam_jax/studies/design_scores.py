@@ -346,14 +346,14 @@ class DesignScores:
         trained, reference = self.training is not None, self.reference
         free = [(value.variable, value.shots) for value in self.found[0].values]
 
-        def row(one: Candidate, numbers: list[str], found: bool) -> list[str]:
+        def row(one: Candidate, numbers: list[str]) -> list[str]:
             gains = [one.predicted_gain, *([one.training_gain_db] if trained else [])]
             reported = [number(one.reported, 3), *(signed(gain, 3) for gain in gains)]
-            ended = one.status.replace("_", " ") if found else "–"
-            return [one.name, *numbers, *reported, ended, "; ".join(one.active_limits) or "–"]
+            end = one.status.replace("iterations_exhausted", "stopped").replace("_", " ")
+            return [one.name, *numbers, *reported, end or "–", "; ".join(one.active_limits) or "–"]
 
-        rows = [row(reference, [reference.text(*each) for each in free], False)]
-        rows += [row(one, [str(value) for value in one.values], True) for one in self.found]
+        rows = [row(reference, [reference.text(*each) for each in free])]
+        rows += [row(one, [str(value) for value in one.values]) for one in self.found]
         labels = (f"{REPORTED[name].of_shots(shots)}\n(tolerance)" for name, shots in free)
         gains = ("gain", *(("training\ngain, dB",) if trained else ()))
         headings = ("design", *labels, self.objective.label, *gains, "descent", "against limits")

@@ -143,7 +143,7 @@ def measure_matrix(
                     writer,
                     Scaled(Sparse(table, plane.shape, frame), counts),
                     jax.random.fold_in(key, number) if number else key,
-                    deviation=calibration.noise,
+                    noise_std=calibration.noise,
                     offset=calibration.offset,
                 )
             measured.append(measuring.recover_matrix(captures))

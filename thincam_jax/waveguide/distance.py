@@ -14,10 +14,10 @@ solved for F, and a distance is as likely as the picture that it leaves:
 A wrong distance leaves ghosts and adds negative ones, which no neighbouring pixel predicts.
 """
 
-import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -42,20 +42,16 @@ _LEVEL = 0.025  # chance to prefer a distance to one that is as good
 _GAIN = math.log(20.0)  # least difference of log-likelihoods to every rival
 _SOLUTIONS = 6  # fixed-point steps; ghosts have a fifth of the light, so 0.2⁶ is left
 
-
-class DistanceStatus(enum.IntEnum):
-    """Status of a distance from ghosts."""
-
-    DETERMINED = 0
-    AMBIGUOUS = 1  # other distances explain the capture as well, within its statistics
-    AT_END = 2  # the likeliest is an end of the range; the object may be outside of it
+DistanceStatus = Literal["determined", "ambiguous", "at_end"]
 
 
 @dataclass(frozen=True, eq=False)
 class GhostDistance:
     """Distance of a flat object, and how well its capture determines it.
 
-    - `distance`: the likeliest, mm. `standard_error`: mm; infinite unless it is DETERMINED.
+    - `distance`: the likeliest, mm. `standard_error`: mm; infinite unless it is determined.
+    - `status`: "determined"; "ambiguous" where other distances explain the capture as well, within
+      its statistics; "at_end" of the range, outside of which the object may be.
     - `distances`: all that were compared, mm, increasing.
     - `log_likelihood`: log-likelihood of each distance, 0 at the likeliest.
     - `lead`: Student's t by which the likeliest is better than each, over parts of the capture.
@@ -70,7 +66,7 @@ class GhostDistance:
 
     @property
     def plausible(self) -> Float[np.ndarray, " plausible"]:
-        """Distances that the capture does not exclude, mm: the answer where it is AMBIGUOUS."""
+        """Distances that the capture does not exclude, mm: the answer where it is ambiguous."""
         return self.distances[~_excluded(self.log_likelihood, self.lead)]
 
 
@@ -91,7 +87,7 @@ def distance_from_ghosts(
     1/(d1 + d2), of a quarter of a pixel of the first ghost.
 
     A picture may repeat itself as if by a ghost. So the capture is divided into 30 tiles, and the
-    likeliest distance is DETERMINED only if it is better than every other that moves the first
+    likeliest distance is "determined" only if it is better than every other that moves the first
     ghost by 3/4 of a pixel or more, by Student's t of the tiles' differences at a one-sided level
     of 2.5 % (Vuong 1989) and by a likelihood ratio of 20; and better, likewise, than ghosts on the
     opposite side of the image, where no distance puts them and patterns repeat as well. The
@@ -114,7 +110,7 @@ def distance_from_ghosts(
     **Validity**: a flat object, parallel to the plate, with no other light. The error grows as
     (d1 + d2)²: on 66² pixels of 32 µm at 40 dB about 1 mm at 300, 3 mm at 550 and 16 mm at 900 mm.
     Nothing is determined of a blank object that fills the field; of 48 photographs of natural
-    scenes 14 were DETERMINED, never wrong, and 34 left several `plausible` distances. It takes 2 s
+    scenes 14 were determined, never wrong, and 34 left several `plausible` distances. It takes 2 s
     for 66² pixels, growing as the cube of the side: bin finer captures. Eager: the result holds
     plain numbers.
 
@@ -136,7 +132,7 @@ def distance_from_ghosts(
     picture = jnp.asarray(resize(sample_image("camera", linear=True), (80, 80)), jnp.float32)
     capture = wg.system_operator(camera, plane)(picture)
     found = wg.distance_from_ghosts(camera, np.asarray(capture), nearest=300.0, farthest=1000.0)
-    print(found.status.name, found.distance, found.standard_error)
+    print(found.status, found.distance, found.standard_error)
     ```
 
     See also `trace`, `ObjectPlane`.
@@ -326,12 +322,12 @@ def _judged(search: _Search, sides: Float[np.ndarray, "tile distance_and_side"])
     inverse = search.inverse[0] - place * step
     error = math.hypot(error, _MODEL_ERROR / search.pixels) * step / inverse**2
     if not 2 <= best <= total.size - 3:
-        status = DistanceStatus.AT_END
+        status = "at_end"
     elif control and math.isfinite(error) and _excluded(log_likelihood, lead)[rivals].all():
-        status = DistanceStatus.DETERMINED
+        status = "determined"
     else:
-        status = DistanceStatus.AMBIGUOUS
-    if status != DistanceStatus.DETERMINED:
+        status = "ambiguous"
+    if status != "determined":
         error = math.inf
     distance = float(1 / inverse - (1 / search.inverse[0] - search.distances[0]))
     order = np.argsort(search.distances)

@@ -1,6 +1,7 @@
 """`thincam reconstruct`: from files to files, in one line what is wrong, and Ctrl-C."""
 
 import json
+import re
 from typing import get_type_hints
 
 import numpy as np
@@ -102,7 +103,8 @@ def test_twelve_bit_capture(grey, tmp_path):
     assert objectives[-1] < 1e-2 * objectives[0]
     assert record["image"]["maximum"] == pytest.approx(image.max())
     assert "numpy" in record["environment"]["versions"]
-    assert "image.png: iterations exhausted after 80 iterations" in result.stdout
+    told = r"image.png: stopped after 80 iterations; the objective still fell by [\d.e-]+ % an iter"
+    assert re.search(told, result.stdout)
 
 
 def _displayed(image):

@@ -73,7 +73,7 @@ def test_same_image_as_step_by_step(folder, tmp_path):
     (result,) = run_jobs(planned, sources(folder), whole, output)
     assert isinstance(result, Finished)
     image = np.load(output.path)
-    ready = run.Rig(sources(folder)).prepare(folder / "first.tif")
+    ready = run.Inputs(sources(folder)).prepare(folder / "first.tif")
     rows, columns = simulated.SHAPE
     light = simulated.scipy.signal.fftconvolve(image, ready.psf[0], mode="valid")
     assert light.shape == (rows, columns)
@@ -122,7 +122,7 @@ def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, ro
 
 
 def test_what_overflows_is_not_written(folder, tmp_path, monkeypatch):
-    lost = Reconstruction(jnp.full((1, 2, 3), jnp.nan), None, ending="iterations_exhausted")
+    lost = Reconstruction(jnp.full((1, 2, 3), jnp.nan), None, ended="iterations_exhausted")
     monkeypatch.setattr(prepared, "reconstruct", lambda *_, **__: lost)
     output = Output(tmp_path / "first.png")
     planned = plan_jobs(folder / "first.tif", sources(folder), output)

@@ -87,8 +87,8 @@ def test_new_values_are_not_compiled_again(network, image):
         (jnp.ones((0, 3)), 0.1, "not empty"),
         (jnp.full((3, 4), jnp.nan), 0.1, "holds NaN or infinity; give finite"),
         (jnp.ones((3, 4), complex), 0.1, "complex128 of shape .*; give an array of real"),
-        (jnp.ones((3, 4)), 0.0, "give sigma > 0"),
-        (jnp.ones((3, 4)), jnp.nan, "sigma is NaN; give a number"),
+        (jnp.ones((3, 4)), 0.0, "give noise_std > 0"),
+        (jnp.ones((3, 4)), jnp.nan, "noise_std is NaN; give a number"),
         (jnp.ones((2, 3, 4)), jnp.ones(3), r"shape \(3,\); give one number, or one an image"),
     ],
 )

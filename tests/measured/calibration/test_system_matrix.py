@@ -60,7 +60,7 @@ def test_without_dark_frames_the_offset_is_in_the_first_cell(tmp_path):
 @pytest.mark.parametrize(("display", "gain"), [("binary", 4), ("complementary", 2)])
 def test_noise_is_averaged_over_the_patterns(display, gain, tmp_path):
     """Of a cell: 4σ²/N, or 2σ²/N with complements."""
-    captures = simulated(tmp_path, HadamardSeries(CELLS, display=display), deviation=0.1)
+    captures = simulated(tmp_path, HadamardSeries(CELLS, display=display), noise_std=0.1)
     error = np.asarray(recover_matrix(captures).matrix)[:, 1:] - TRUTH[:, 1:]
     assert np.mean(error**2) == pytest.approx(gain * 0.1**2 / 32, rel=0.1)
 
@@ -103,7 +103,7 @@ def test_an_image_comes_back_by_the_measured_matrix(tmp_path):
     writer = HadamardCaptures.create(
         tmp_path / "captures.zarr", HadamardSeries(CELLS), SHAPE, bits=12
     )
-    captures = simulate_captures(writer, operator, jax.random.key(5), deviation=5.0, offset=40.0)
+    captures = simulate_captures(writer, operator, jax.random.key(5), noise_std=5.0, offset=40.0)
     image = jnp.linspace(0, 1, 32, dtype=jnp.float32).reshape(CELLS)
     recording = tc.Recording(operator(image), recover_matrix(captures), noise_variance=1e-4)
     found = tc.reconstruct(recording, tc.Ridge(1e-6))

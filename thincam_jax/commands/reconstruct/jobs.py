@@ -118,7 +118,7 @@ class Inputs:
         """The background of all images; None of a folder, which has one for each."""
         if not isinstance(given, Path):
             return given
-        return None if given.is_dir() else self._dark(given, bits)
+        return None if given.is_dir() else self._dark(given, bits=bits)
 
     def _read(
         self, files: Sequence[Path], dark: Sequence[Path], bits: int | None, is_psf: bool = False
@@ -130,7 +130,7 @@ class Inputs:
         level = self.psf_background if is_psf else self.background
         if is_psf and level is None and isinstance(self.background, measured.Raw):
             level = self.background if self.background.bits == images[0].bits else None
-        levels: list[Any] = [self._dark(path, bits) for path in dark] or [level] * n
+        levels: list[Any] = [self._dark(path, bits=bits) for path in dark] or [level] * n
         for i, one in enumerate(levels):
             if isinstance(one, measured.Raw):
                 images[i], levels[i] = without_hot_pixels(images[i], one)

@@ -52,7 +52,7 @@ class Finished:
 
     - `line`: a line that says what was done. `doubt`: fault with an image that does not explain
       its capture, or nothing.
-    - `status`: see `Reconstruction.ending`.
+    - `status`: see `Reconstruction.status`.
     - `marked`: the image with its uncertain pixels marked, as a PNG.
     - `findings`: faults that residual and noise show.
     """
@@ -223,9 +223,9 @@ def _reconstruct(
         )
         doubt = f"the image explains almost nothing of the capture; {why}"
     line = (
-        f"{found.status.replace('_', ' ')} after {found.iterations} iterations, relative data "
-        f"residual {residual:.3g}, {found.seconds:.1f} s, noise {noise.counts:.3g} counts "
-        f"({noise.found.split()[0]})" + (f"; {found.reason}" if found.reason else "")
+        f"{found.ending}; relative data residual {residual:.3g}, {found.seconds:.1f} s, "
+        f"noise {noise.counts:.3g} counts ({noise.found.split()[0]})"
+        + (f"; {found.reason}" if found.reason else "")
     )
     image, facts = done.image(recipe.field), _facts(done, recipe)
     findings = () if found.status == "interrupted" else tuple(_doubts(job, ready, done))

@@ -184,4 +184,4 @@ class Acquisition:
             return self.captures().mean(axis=0, keepdims=True), None
         exposure, found = self.settings[0].exposure, self.merged()
         frame = (exposure * found.rate)[None].astype(np.float32)
-        return frame, exposure**2 * found.variance
+        return frame, exposure**2 * found.noise_variance

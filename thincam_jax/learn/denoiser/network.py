@@ -101,37 +101,37 @@ class Denoiser(Module):
         like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
         return Denoiser(read_weights(path, like))
 
-    def __call__(self, image: Numbers, sigma: Numbers) -> Float[Array, "*batch y x"]:
+    def __call__(self, image: Numbers, noise_std: Numbers) -> Float[Array, "*batch y x"]:
         """The denoised image.
 
         **Arguments**
 
         - `image`: (*batch, y, x); colours are a batch, each is denoised by itself.
-        - `sigma`: standard deviation of the noise, in the unit of the image; one number, or one
+        - `noise_std`: standard deviation of the noise, in the unit of the image; one number, or one
           for each image of the batch.
 
         **Errors**: ValueError or TypeError, one line, for an image of other dimensions, numbers
-        that are not finite, and a sigma that is not positive or does not fit the batch.
+        that are not finite, and a noise_std that is not positive or does not fit the batch.
         """
-        image, sigma = _checked(image, sigma)
-        return _denoised(self.network, image, sigma)
+        image, noise_std = _checked(image, noise_std)
+        return _denoised(self.network, image, noise_std)
 
 
-def _checked(image: Numbers, sigma: Numbers) -> tuple[Array, Array]:
+def _checked(image: Numbers, noise_std: Numbers) -> tuple[Array, Array]:
     wanted = "give finite numbers of shape (*batch, y, x)"
-    image, sigma = checks.array("image", image), checks.array("sigma", sigma)
+    image, noise_std = checks.array("image", image), checks.array("noise_std", noise_std)
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(f"image has shape {image.shape}; {wanted}, not empty")
     if not checks.is_traced(image) and not np.isfinite(np.asarray(image)).all():
         raise ValueError(f"image holds NaN or infinity; {wanted}")
     image = checks.as_array(image, floating=True)
     batch = image.shape[:-2]
-    if sigma.shape not in ((), batch):
+    if noise_std.shape not in ((), batch):
         raise ValueError(
-            f"sigma has shape {sigma.shape}; give one number, or one an image: {batch}"
+            f"noise_std has shape {noise_std.shape}; give one number, or one an image: {batch}"
         )
-    sigma = checks.positive_all("sigma", sigma.astype(image.dtype), "the image's unit")
-    return image, jnp.broadcast_to(sigma, batch)
+    noise_std = checks.positive_all("noise_std", noise_std.astype(image.dtype), "the image's unit")
+    return image, jnp.broadcast_to(noise_std, batch)
 
 
 @eqx.filter_jit

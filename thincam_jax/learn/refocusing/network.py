@@ -138,7 +138,7 @@ class RefocusNetwork(eqx.Module):
     - `planes`: planes of its camera; not learnt, and rebuilt from the camera when a network is
       loaded.
 
-    Captures are (*batch, y, x) in any unit; `deviation` is the standard deviation of their noise
+    Captures are (*batch, y, x) in any unit; `noise_std` is the standard deviation of their noise
     per pixel in the same unit, one number or one for each capture. Images come back as the field is
     projected on the sensor (turned by 180°), in the unit in which a uniform scene of radiance 1
     makes the PSF's light.
@@ -223,45 +223,45 @@ class RefocusNetwork(eqx.Module):
         return eqx.tree_at(lambda n: n.weights.prior[number], self, prior)
 
     def focus(
-        self, captures: Numbers, distance: Number, deviation: Numbers
+        self, captures: Numbers, distance: Number, noise_std: Numbers
     ) -> Float[Array, "*batch y x"]:
         """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them."""
-        return _batched("image", self, captures, deviation, self.camera.within(distance))
+        return _batched("image", self, captures, noise_std, self.camera.within(distance))
 
     def sweep(
-        self, captures: Numbers, distances: Numbers | Sequence[Number], deviation: Numbers
+        self, captures: Numbers, distances: Numbers | Sequence[Number], noise_std: Numbers
     ) -> Float[Array, "distance *batch y x"]:
         """`focus` at each of `distances`."""
         distances = self.camera.within(distances)
-        images = _batched("image", self, captures, deviation, distances)
+        images = _batched("image", self, captures, noise_std, distances)
         return jnp.moveaxis(images, -3, 0)
 
-    def all_in_focus(self, captures: Numbers, deviation: Numbers) -> Float[Array, "*batch y x"]:
+    def all_in_focus(self, captures: Numbers, noise_std: Numbers) -> Float[Array, "*batch y x"]:
         """Images in which everything is sharp, as a pinhole would see the scene."""
-        return _batched("all_in_focus", self, captures, deviation)
+        return _batched("all_in_focus", self, captures, noise_std)
 
-    def distance(self, captures: Numbers, deviation: Numbers) -> DistanceMap:
+    def distance(self, captures: Numbers, noise_std: Numbers) -> DistanceMap:
         """The distance of what each pixel shows."""
-        return _batched("distance", self, captures, deviation)
+        return _batched("distance", self, captures, noise_std)
 
-    def consistency(self, captures: Numbers, deviation: Numbers) -> Float[Array, "*batch"]:
+    def consistency(self, captures: Numbers, noise_std: Numbers) -> Float[Array, "*batch"]:
         """Residual of the explained capture, root mean square, over the noise's deviation.
 
         About 1: the stack explains all that was seen but noise. Far more: the image is not of this
         capture. Far less: noise was explained, too.
         """
-        return _batched("consistency", self, captures, deviation)
+        return _batched("consistency", self, captures, noise_std)
 
 
 def explain(
     network: RefocusNetwork,
     capture: Float[Array, "y x"],
-    deviation: Float[Array, ""],
+    noise_std: Float[Array, ""],
     distance: Float[Array, ""],
 ) -> Explained:
     """The stack of planes that explains a capture, focused on a distance, mm."""
     weights, planes = network.weights, network.planes
-    mean, capture, sigma = normalised(planes, capture, deviation)
+    mean, capture, sigma = normalised(planes, capture, noise_std)
     stand = network.camera.stand(distance.astype(planes.dtype))
     spectra = planes.spectra_at(1 / stand.inverse)
     given = (capture, sigma, stand, spectra)
@@ -273,12 +273,12 @@ def explain(
     return Explained(cleaned, stand, mean, rms / jnp.where(sigma > 0, sigma, 1))
 
 
-def normalised(planes: Planes, capture: Float[Array, "y x"], deviation: Float[Array, ""]):
+def normalised(planes: Planes, capture: Float[Array, "y x"], noise_std: Float[Array, ""]):
     """The scene's mean, and capture and noise in units of it after optics."""
     mean = planes.mean(capture)
     # A dark capture has the mean 0 and stays dark.
     scale = 1 / (planes.unit.astype(planes.dtype) * jnp.where(mean > 0, mean, 1))
-    return mean, capture * scale, deviation * scale
+    return mean, capture * scale, noise_std * scale
 
 
 def prepared(
@@ -339,9 +339,9 @@ def seen_of(
     return planes.seen(jnp.sum(planes.from_field(stack) * spectra, axis=0))
 
 
-def noise_level(deviation: Float[Array, ""]) -> Float[Array, ""]:
+def noise_level(noise_std: Float[Array, ""]) -> Float[Array, ""]:
     """Noise level as a U-Net reads it: log₁₀ of its deviation, in units of the scene's mean."""
-    return jnp.log10(deviation**2 + 1e-8) / 2
+    return jnp.log10(noise_std**2 + 1e-8) / 2
 
 
 def constant_images(like: Float[Array, "..."], *values: Number) -> Float[Array, "value y x"]:
@@ -350,7 +350,7 @@ def constant_images(like: Float[Array, "..."], *values: Number) -> Float[Array, 
     return jnp.stack([jnp.broadcast_to(jnp.asarray(v, like.dtype), shape) for v in values])
 
 
-def flattened(network: RefocusNetwork, captures: Numbers, deviation: Numbers):
+def flattened(network: RefocusNetwork, captures: Numbers, noise_std: Numbers):
     """Captures (element, y, x), the deviation of each, and the batch axes that they had."""
     captures = jnp.asarray(captures, network.planes.dtype)
     sensor = network.camera.camera.sensor.shape
@@ -359,14 +359,14 @@ def flattened(network: RefocusNetwork, captures: Numbers, deviation: Numbers):
             f"captures have shape {captures.shape}; give (…, {sensor[0]}, {sensor[1]})"
         )
     batch = captures.shape[:-2]
-    deviation = jnp.broadcast_to(jnp.asarray(deviation, captures.dtype), batch)
-    return captures.reshape(-1, *sensor), deviation.reshape(-1), batch
+    noise_std = jnp.broadcast_to(jnp.asarray(noise_std, captures.dtype), batch)
+    return captures.reshape(-1, *sensor), noise_std.reshape(-1), batch
 
 
-def _batched(what: str, network: RefocusNetwork, captures, deviation, distance=None):
+def _batched(what: str, network: RefocusNetwork, captures, noise_std, distance=None):
     """A property of the explanation of each capture, focused on the same distance or distances."""
-    captures, deviation, batch = flattened(network, captures, deviation)
-    out = _explained(what, network, captures, deviation, distance)
+    captures, noise_std, batch = flattened(network, captures, noise_std)
+    out = _explained(what, network, captures, noise_std, distance)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
@@ -374,8 +374,8 @@ def _batched(what: str, network: RefocusNetwork, captures, deviation, distance=N
 def _explained(what: str, network: RefocusNetwork, captures, deviations, distance):
     distance = network.camera.middle if distance is None else distance
 
-    def one(capture, deviation, distance):
-        return getattr(explain(network, capture, deviation, distance), what)
+    def one(capture, noise_std, distance):
+        return getattr(explain(network, capture, noise_std, distance), what)
 
     # Side by side: in a loop XLA runs convolutions slowly on a CPU.
     several = one if distance.ndim == 0 else jax.vmap(one, in_axes=(None, None, 0))

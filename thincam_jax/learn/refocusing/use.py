@@ -44,17 +44,17 @@ def read(
     network: RefocusNetwork,
     captures: Numbers,
     distances: Numbers | Sequence[Number],
-    deviation: Numbers,
+    noise_std: Numbers,
 ) -> Reading:
     """Images focused on each of `distances`, mm, and everything else, for captures (*batch, y, x).
 
     `distances`: (distance,), or (*batch, distance) with their own for each capture.
     """
-    captures, deviation, batch = flattened(network, captures, deviation)
+    captures, noise_std, batch = flattened(network, captures, noise_std)
     each = network.camera.within(distances)
     count = each.shape[-1]
     each = jnp.broadcast_to(each, (*batch, count))
-    found = _read(network, captures, deviation, each.reshape(-1, count))
+    found = _read(network, captures, noise_std, each.reshape(-1, count))
     return jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
 
 
@@ -63,8 +63,8 @@ def _read(network: RefocusNetwork, captures, deviations, distances) -> Reading:
     return jax.vmap(lambda *one: _read_one(network, *one))(captures, deviations, distances)
 
 
-def _read_one(network: RefocusNetwork, capture, deviation, distances) -> Reading:
-    explained = jax.vmap(lambda t: explain(network, capture, deviation, t))(distances)
+def _read_one(network: RefocusNetwork, capture, noise_std, distances) -> Reading:
+    explained = jax.vmap(lambda t: explain(network, capture, noise_std, t))(distances)
     first = jax.tree.map(lambda leaf: leaf[0], explained)
     seen = first.distance
     return Reading(

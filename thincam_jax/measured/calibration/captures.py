@@ -228,14 +228,14 @@ def simulate_captures(
     operator: AbstractOperator,
     key: Key,
     *,
-    deviation: float = 0.0,
+    noise_std: float = 0.0,
     offset: float = 0.0,
 ) -> HadamardCaptures:
     """Simulate the captures of a known camera and write them to a store, or keep them in memory.
 
-    - `writer`: by `create_captures`; or the series alone, whose frames stay in memory.
+    - `writer`: by `HadamardCaptures.create`; or the series alone, whose frames stay in memory.
     - `operator`: from the cells, 1 is white, to the sensor, in counts (`Scaled` sets the exposure).
-    - `deviation`: standard deviation of white noise, and `offset`: the dark level, in counts. For a
+    - `noise_std`: standard deviation of white noise, and `offset`: the dark level, in counts. For a
       writer with `bits` the counts are rounded and clipped.
 
     **Errors**: ValueError where the operator's shapes are not those of the cells and the sensor.
@@ -255,7 +255,7 @@ def simulate_captures(
         numbers = range(start, min(start + TOGETHER, series.frame_count))
         cells = np.stack([series.frame(number) for number in numbers]).astype(kind)
         noise = jax.random.normal(jax.random.fold_in(key, start), (len(numbers), *shape), kind)
-        images = np.asarray(operator(jnp.asarray(cells)) + deviation * noise + offset)
+        images = np.asarray(operator(jnp.asarray(cells)) + noise_std * noise + offset)
         if captures.bits is not None:
             images = np.clip(np.rint(images), 0, 2**captures.bits - 1)
         for number, image in zip(numbers, images, strict=True):
