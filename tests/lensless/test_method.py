@@ -1,5 +1,7 @@
 """`PsfMethod`: what it refuses, and the defaults that a mask and a grid give it."""
 
+import inspect
+
 import numpy as np
 import pytest
 
@@ -31,25 +33,25 @@ def test_settings_that_are_refused(settings, message):
 
 def test_defaults_follow_from_mask_and_grid():
     mask, grid = tc.Pinhole(0.5), tc.Grid((32, 48), np.float32(0.02))
-    assert psf_method(mask, grid, "separable", pixel_integration=False) == tc.PsfMethod(
-        "separable", "float32"
-    )
-    found = psf_method(mask, grid, "angular_spectrum", pixel_integration=True)
+    assert psf_method(mask, grid, "separable") == tc.PsfMethod("separable", "float32", True)
+    found = psf_method(mask, grid, "angular_spectrum")
     assert found == tc.PsfMethod("angular_spectrum", "float32", True, 3, (25, 25))
-    assert psf_method(mask, grid, found, pixel_integration=False) == found
-    assert (
-        psf_method(
-            mask, grid, tc.PsfMethod("angular_spectrum", "float64"), pixel_integration=False
-        ).samples
-        == 1
-    )
+    assert psf_method(mask, grid, found) == found
+    points = tc.PsfMethod("angular_spectrum", "float64", pixel_integration=False)
+    assert psf_method(mask, grid, points).samples == 1
 
 
-def test_an_average_that_the_method_asks_for():
+def test_pixels_are_averaged_unless_either_says_no():
+    """By default, as `capture` and `Cameras` do; a method and the function that takes it."""
     camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((6, 7), 0.05), 2.0)
     points, average = (
         tc.psf(camera, wavelength=5e-4, pixel_integration=both) for both in (False, True)
     )
+    np.testing.assert_array_equal(tc.psf(camera, wavelength=5e-4), average)
     asked = tc.psf(camera, wavelength=5e-4, model=tc.PsfMethod(pixel_integration=True))
     np.testing.assert_array_equal(asked, average)
+    method = tc.PsfMethod(pixel_integration=False)
+    np.testing.assert_array_equal(tc.psf(camera, wavelength=5e-4, model=method), points)
     assert np.abs(points - average).max() > 0.01
+    for function in (tc.psf, tc.otf, tc.mtf, tc.choose_model, tc.predict_error, tc.plot.psf):
+        assert inspect.signature(function).parameters["pixel_integration"].default is True

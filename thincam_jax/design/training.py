@@ -272,11 +272,8 @@ def _kernels(design: Design, training: Training) -> Float[Array, "capture k l"]:
     sensor, there = Sensor(grid.shape, grid.pitch), training.setup.object_distance
 
     def kernel(beta, phase, distance, wavelength):
-        return psf(
-            LenslessCamera(design.mask(beta, phase), sensor, distance),
-            wavelength=wavelength,
-            object_distance=there,  # pyright: ignore[reportArgumentType]
-            pixel_integration=training.setup.pixel_integration,
-        )
+        camera = LenslessCamera(design.mask(beta, phase), sensor, distance)
+        light = {"wavelength": wavelength, "object_distance": there}
+        return psf(camera, **light, pixel_integration=training.setup.pixel_integration)
 
     return jax.vmap(kernel)(design.beta, design.phase, design.distance, design.wavelength)

@@ -71,12 +71,9 @@ def capture(
             raise ValueError("a plan chooses pixel_integration: leave it out")
         image = run_plan(model, camera, scene)
     else:
-        average = pixel_integration is not False
-        if camera.sensor.angular_response is not None and as_method(model).field_tolerance is None:
+        how = as_method(model, pixel_integration is not False)
+        if camera.sensor.angular_response is not None and how.field_tolerance is None:
             warnings.warn(_ON_AXIS, AccuracyWarning, stacklevel=3)
-        parts = (
-            expose(camera, plane, scene.spectrum, model=model, pixel_integration=average)
-            for plane in scene.planes
-        )
+        parts = (expose(camera, plane, scene.spectrum, how) for plane in scene.planes)
         image = functools.reduce(operator.add, parts)
     return read_out(camera.sensor, image, noise=noise, key=key)

@@ -29,21 +29,13 @@ _STEP = 16
 
 
 def expose(
-    camera: LenslessCamera,
-    plane: ImagePlane,
-    spectrum: Spectrum,
-    *,
-    model: Model | PsfMethod = "separable",
-    pixel_integration: bool = True,
+    camera: LenslessCamera, plane: ImagePlane, spectrum: Spectrum, model: Model | PsfMethod
 ) -> Float[Array, "*batch y x"]:
     """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
     shape = projected_shape(camera, plane)
     check_memory(camera.sensor, shape, plane.image.shape[:-2])
-    method = as_method(model, pixel_integration)
-    convolution = imaging_operator(
-        camera, spectrum, plane.distance, field_shape=shape, model=method
-    )
-    return convolution(project(camera, plane, shape))
+    seen = imaging_operator(camera, spectrum, plane.distance, field_shape=shape, model=model)
+    return seen(project(camera, plane, shape))
 
 
 def imaging_operator(

@@ -69,8 +69,6 @@ AVERAGES = 1 / 4
 _SLOW = 1e10
 # Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
 _IN_CELL, _UNKNOWN_CELL = 16, 7
-# Directions of fringes in the mean of `mtf`.
-_DIRECTIONS = 32
 
 
 @checked
@@ -236,14 +234,14 @@ def mtf(
 
 @jax.jit
 def _contrast(h: Float[Array, "y x"], grid: Grid, rho: Float[Array, " n"]) -> Float[Array, " n"]:
-    turns = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    along = (np.asarray(part(turns), h.dtype) for part in (np.sin, np.cos))
+    angles = np.pi * (np.arange(32) + 0.5) / 32
+    along = (np.asarray(part(angles), h.dtype) for part in (np.sin, np.cos))
     rows, columns = (
         turn_phasor(jnp.ravel(rho[:, None] * part)[:, None] * place)
         for part, place in zip(along, (grid.y, grid.x), strict=True)
     )
     power = squared_modulus(jnp.sum(product(rows, as_complex(h)) * columns, axis=1))
-    return flat_root(jnp.mean(power.reshape(-1, _DIRECTIONS), axis=1)) / jnp.sum(h)
+    return flat_root(jnp.mean(power.reshape(-1, 32), axis=1)) / jnp.sum(h)
 
 
 def _irradiance(

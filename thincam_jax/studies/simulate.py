@@ -28,15 +28,10 @@ class Capture:
 
 def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
     """Light on the sensor, (*channel, y, x), without saturation."""
-    scene = Scene(planes, exposure.wavelength)
+    scene, pixels = Scene(planes, exposure.wavelength), study.pixel_integration
+    method = PsfMethod(study.model, None, pixels, field_tolerance=study.field_tolerance)
     images = (
-        forward.expose(
-            study.camera(exposure),
-            plane,
-            scene.spectrum,
-            model=PsfMethod(study.model, field_tolerance=study.field_tolerance),
-            pixel_integration=study.pixel_integration,
-        )
+        forward.expose(study.camera(exposure), plane, scene.spectrum, method)
         for plane in scene.planes
     )
     return functools.reduce(operator.add, images)

@@ -4,7 +4,7 @@ import functools
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -107,13 +107,12 @@ class FitState(eqx.Module):
     def _psf(self, pixel_integration: bool, grid: Grid | None, phase) -> Float[Array, "y x"]:
         turned = self.mask.phase + phase
         camera = eqx.tree_at(lambda camera: camera.mask.phase, self.camera, turned)
-        return psf(
-            camera if grid is None else camera.on_grid(grid),
-            wavelength=self.wavelength,
-            object_distance=1 / self.nearness,  # pyright: ignore[reportArgumentType]
-            model="separable",
-            pixel_integration=pixel_integration,
-        )
+        camera = camera if grid is None else camera.on_grid(grid)
+        light: dict[str, Any] = {
+            "wavelength": self.wavelength,
+            "object_distance": 1 / self.nearness,
+        }
+        return psf(camera, **light, pixel_integration=pixel_integration)
 
     def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "FitState":
         """State after dimensionless steps of the named parameters.
