@@ -33,7 +33,7 @@ MODULES = (
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.
-WITHIN = {"draw_batch", "linear_objective", "match_objective", "restored_objective", "drawn_error"}
+WITHIN = {"draw_batch", "linear_objective", "match_objective", "restored_objective"}
 WITHIN |= {"FrontSearch", "Training", "TrainingDescents", "adjoint_error"}
 
 

@@ -14,8 +14,6 @@ from score_refocusing import refocus_camera
 
 from thincam_jax import learn
 from thincam_jax.learn.checkpoint import read_description
-from thincam_jax.learn.denoiser.network import network_description
-from thincam_jax.learn.refocusing import store
 
 ROOM = Path(__file__).parents[2] / "thincam_jax/learn"
 
@@ -25,13 +23,14 @@ def halved(weights):
 
 
 (path,) = sys.argv[1:]
-if read_description(path)["kind"] == "refocusing network":
+known = read_description(path)
+if known["kind"] == "refocusing network":
     place = ROOM / "refocusing/shipped.thincam"
     network = learn.RefocusNetwork.load(path, refocus_camera())
     half = eqx.tree_at(lambda n: n.weights, network, halved(network.weights))
-    half.save(place, store.network_description(path)["training"])
+    half.save(place, known["training"])
 else:
     place = ROOM / "denoiser/shipped.thincam"
     half = learn.Denoiser(halved(learn.Denoiser.load(path).network))
-    half.save(place, network_description(path)["training"])
+    half.save(place, known["training"])
 print(f"{place}: {place.stat().st_size / 1e6:.1f} MB")

@@ -13,7 +13,7 @@ from helpers import AS_IN_USE, count_traces
 from thincam_jax._core.grids import Grid
 from thincam_jax.design import DesignSpace, PhotonNoise, PowerLaw, Setup, SignalNoise, Variable
 from thincam_jax.design.design import Design
-from thincam_jax.design.end_to_end import drawn_error, end_to_end_error, restore
+from thincam_jax.design.end_to_end import end_to_end_error, restore
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.stochastic import stochastic_descent
 from thincam_jax.design.training import ConjugateGradients, TrainedSensor, Training
@@ -318,11 +318,3 @@ def test_steps_without_a_number_are_skipped_and_counted():
     )
     assert found.skipped == int(jnp.sum(jnp.isnan(found.history))) > 10
     np.testing.assert_allclose(found.values, target, atol=0.4)
-
-
-@pytest.mark.thorough
-def test_drawn_noise_is_other_noise_and_of_the_key():
-    given, chosen = training(), design()
-    error = eqx.filter_jit(drawn_error)
-    errors = [float(error(chosen, given, jax.random.key(k))) for k in (0, 0, 1)]
-    assert errors[0] == errors[1] != errors[2]

@@ -16,12 +16,12 @@ from refocusing_scores import capture_scene, flat_scene, scores
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera
-from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
+from thincam_jax.learn.checkpoint import CheckpointError, network_description, write_arrays
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.sources import as_json, drawn
-from thincam_jax.learn.refocusing.store import SHIPPED, SHIPPED_FILE, network_description
+from thincam_jax.learn.refocusing.store import KIND, SHIPPED, SHIPPED_FILE
 from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
 from thincam_jax.learn.refocusing.use import Learned, doubt
 from thincam_jax.learn.training import TrainingOptions
@@ -37,7 +37,7 @@ def file(tmp_path_factory):
 
 @pytest.mark.thorough
 def test_a_network_comes_back_for_its_camera(file):
-    (entry,) = network_description(file)["training"]["images"]["trained on"]
+    (entry,) = network_description(file, KIND)["training"]["images"]["trained on"]
     assert entry["licence"] == "drawn" and re.fullmatch("[0-9a-f]{64}", entry["sha256"])
     # Whatever its sensor makes of the light; as all it was trained for; or with its light.
     seen = tc.Cameras([tiny.camera()], wavelength=500 * nm, object_distance=80.0)
@@ -60,7 +60,7 @@ def test_training_goes_on_to_the_same_bits(tmp_path):
     assert eqx.tree_equal(whole.model.planes, tiny.network().planes)
     found = RefocusNetwork.load(tmp_path / NETWORK, tiny.camera())
     assert eqx.tree_equal(found.weights, whole.model.weights)
-    told = network_description(tmp_path / NETWORK)["training"]
+    told = network_description(tmp_path / NETWORK, KIND)["training"]
     assert told["steps"] == 4 and len(told["scores"]) == 2
     # As often as nothing is left to be done.
     assert eqx.tree_equal(train(*given, folder=tmp_path).state, whole.state)
@@ -87,12 +87,12 @@ def test_a_file_that_holds_something_else_is_told(file, tmp_path):
     with pytest.raises(CheckpointError, match="holds no refocusing network"):
         RefocusNetwork.load(other, tiny.camera())
     tiny.network().save(other)
-    known = network_description(other)
+    known = network_description(other, KIND)
     known["camera"].pop("light")
     write_arrays(other, tiny.network().weights, known)
     with pytest.raises(CheckpointError, match="tells no whole camera"):
         RefocusNetwork.load(other, tiny.camera())
-    known = network_description(file)
+    known = network_description(file, KIND)
     plain = known["options"]
     for wrong in ({"wings": 2}, {"widths": []}, {"widths": [0]}, {"widths": [4] * 5000}):
         known["options"] = {**plain, **wrong}
@@ -167,7 +167,7 @@ def test_a_short_training_beats_the_linear_start():
 
 def test_what_is_shipped_may_be_given_on():
     """No photograph of a licence that binds those who use the weights, and few bytes."""
-    told = network_description(SHIPPED_FILE)["training"]["images"]
+    told = network_description(SHIPPED_FILE, KIND)["training"]["images"]
     licences = {entry["licence"] for entries in told.values() for entry in entries}
     assert licences == {"scikit-image's own (its data folder's README)", "drawn", "CC0 1.0"}
     assert SHIPPED_FILE.stat().st_size < 4e6

@@ -60,12 +60,10 @@ def test_table_has_a_row_for_each_method(result):
 def test_figures_are_those_of_pyplot(result):
     pyplot.close("all")
     try:
-        figures = result.plot(), result.plot("picture"), result.plot_responses()
-        assert len(pyplot.get_fignums()) == 3
+        figures = result.plot(), result.plot("picture")
+        assert len(pyplot.get_fignums()) == 2
         titles = [ax.get_title().splitlines()[0] for ax in figures[1].axes[:3]]
         assert titles == ["scene", "conventional", "pairs"]
-        left = [ax.get_title(loc="left").partition(",")[0] for ax in figures[2].axes]
-        assert left == ["conventional", "pairs"]
         with pytest.raises(ValueError, match="'no' is no target of this result; choose one of"):
             result.plot("no")
     finally:

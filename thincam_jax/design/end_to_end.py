@@ -25,12 +25,11 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from thincam_jax._core.precision import as_complex, squared_modulus
 from thincam_jax.design.design import Design
@@ -52,12 +51,6 @@ def end_to_end_error(design: Design, training: Training) -> Float[Array, ""]:
     gradients ended above ten times the tolerance.
     """
     return relative_error(restore(design, training), training)
-
-
-def drawn_error(design: Design, training: Training, key: PRNGKeyArray) -> Float[Array, ""]:
-    """`end_to_end_error` with other noise at every key: for a stochastic search."""
-    noise = jax.random.normal(key, training.noise.shape, training.noise.dtype)
-    return end_to_end_error(design, eqx.tree_at(lambda t: t.noise, training, noise))
 
 
 def restore(design: Design, training: Training) -> Float[Array, "image v u"]:

@@ -55,6 +55,15 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
     return _read(path)[0]["description"]
 
 
+def network_description(path: str | os.PathLike[str], kind: str) -> dict[str, Any]:
+    """Description of a network's file of that kind: with `options`, `training`, maybe `camera`."""
+    description = read_description(path)
+    parts = (description.get(name, {}) for name in ("options", "training", "camera"))
+    if description.get("kind") != kind or not all(isinstance(part, dict) for part in parts):
+        raise CheckpointError(f"{path}: holds no {kind}; give a file that a training wrote")
+    return description
+
+
 def read_arrays(path: str | os.PathLike[str], like: Any) -> Any:
     """The pytree `like`, of arrays or of `jax.ShapeDtypeStruct`, with the arrays of the file.
 

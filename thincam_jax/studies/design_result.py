@@ -72,16 +72,6 @@ class DesignResult:
             return None
         return plot.draw_objective(self.found, self.design.best, new_figure(1.0, 1.0))
 
-    def plot_fronts(self) -> "Figure | None":
-        """A panel for each front."""
-        from thincam_jax.plot import design as plot
-        from thincam_jax.plot.frame import new_figure
-
-        fronts, distance = self.scores.pareto, self.design.study.object_distance
-        if fronts is None:
-            return None
-        return plot.draw_fronts(fronts, self.design.reference, distance, new_figure(1.0, 1.0))
-
 
 def _summary(result: DesignResult) -> DesignScores:
     design, found, study = result.design, result.found, result.simulated

@@ -294,13 +294,6 @@ class StudyResult:
 
         return plot.draw_found(chosen, self.evaluations[name], figure=new_figure(1.0, 1.0))[0]
 
-    def plot_responses(self) -> "Figure":
-        """The transfer function of every method, with its limits and those published."""
-        from thincam_jax.plot import studies as plot
-        from thincam_jax.plot.frame import new_figure
-
-        return plot.draw_responses(self.study, self.responses, figure=new_figure(1.0, 1.0))
-
 
 def run(study: Study, targets: Sequence[Target]) -> StudyResult:
     """Every method on every target, and the methods' transfer functions."""

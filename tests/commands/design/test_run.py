@@ -83,7 +83,6 @@ def test_in_memory_it_is_the_same(whole, tmp_path):
     assert len(result.table().rows) == 2
     labels = [text.get_text() for text in result.plot().axes[0].get_legend().get_texts()]
     assert [label.split(" (")[0] for label in labels] == ["pairs", "found 1"]
-    assert result.plot_fronts() is None
 
 
 def test_what_is_written(whole):

@@ -20,7 +20,7 @@ from thincam_jax._core.random import Key, random_key
 from thincam_jax._core.text import of_error
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
-    read_description,
+    network_description,
     read_weights,
     write_arrays,
 )
@@ -91,7 +91,7 @@ class Denoiser(Module):
         that are not finite; OSError for what cannot be read.
         """
         path = _SHIPPED_FILE if str(path) == SHIPPED else path
-        description = network_description(path)
+        description = network_description(path, _KIND)
         try:
             options = _options(description)
             like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
@@ -174,7 +174,7 @@ class NetworkCard:
 def network_card(path: str | os.PathLike[str] = SHIPPED) -> NetworkCard:
     """Card of a network's file. **Errors**: as of `Denoiser.load`."""
     path = _SHIPPED_FILE if str(path) == SHIPPED else path
-    description = network_description(path)
+    description = network_description(path, _KIND)
     training = description["training"]
     try:
         uses = training.get("images", {}).items()
@@ -188,12 +188,3 @@ def network_card(path: str | os.PathLike[str] = SHIPPED) -> NetworkCard:
 def _options(description: dict[str, Any]) -> DenoiserOptions:
     stored = description["options"]
     return DenoiserOptions(tuple(stored["widths"]), tuple(stored["blocks"]))
-
-
-def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """`options` and `training` of a network's file, as JSON."""
-    description = read_description(path)
-    parts = (description.get(name) for name in ("options", "training"))
-    if description.get("kind") != _KIND or not all(isinstance(part, dict) for part in parts):
-        raise CheckpointError(f"{path}: holds no {_KIND}; give a file that a training wrote")
-    return description

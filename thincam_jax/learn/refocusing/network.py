@@ -27,7 +27,12 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax._core.random import Key, random_key
 from thincam_jax._core.text import of_error
-from thincam_jax.learn.checkpoint import CheckpointError, read_weights, write_arrays
+from thincam_jax.learn.checkpoint import (
+    CheckpointError,
+    network_description,
+    read_weights,
+    write_arrays,
+)
 from thincam_jax.learn.refocusing import store
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
@@ -194,8 +199,8 @@ class RefocusNetwork(eqx.Module):
         first number that differs and both its values; OSError for what cannot be read.
         """
         path = store.SHIPPED_FILE if str(path) == store.SHIPPED else path
-        description = store.network_description(path)
-        given = store.same_camera(str(path), description["camera"], cameras)
+        description = network_description(path, store.KIND)
+        given = store.same_camera(str(path), description.get("camera", {}), cameras)
         try:
             stored = description["options"]
             options = NetworkOptions(**{**stored, "widths": tuple(stored["widths"])})

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 
 from thincam_jax.imaging.scene import Spectrum
-from thincam_jax.learn.checkpoint import CheckpointError, difference, read_description
+from thincam_jax.learn.checkpoint import CheckpointError, difference
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras
@@ -24,15 +23,6 @@ SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
 _LISTED = 64
 # What a sensor makes of light; a network takes captures in any unit.
 _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
-
-
-def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Card of a network's file: `camera`, `options`, `training`."""
-    description = read_description(path)
-    parts = (description.get(name) for name in ("camera", "options", "training"))
-    if description.get("kind") != KIND or not all(isinstance(part, dict) for part in parts):
-        raise CheckpointError(f"{path}: holds no {KIND}; give a file that a training wrote")
-    return description
 
 
 def described(value: Any) -> Any:
