@@ -14,9 +14,9 @@ from helpers import relative_l2, shared_data
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.reconstruction import TotalVariation, phase_pairs
+from thincam_jax.reconstruction.assembly import centred_crop
 from thincam_jax.reconstruction.methods import SOLVERS
 from thincam_jax.reconstruction.problem import residuals
-from thincam_jax.reconstruction.recording import centred_crop
 from thincam_jax.reconstruction.regularisers import Cosines, Sparsity, Wavelet
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.synthesis import separate

@@ -11,6 +11,7 @@ from reconstruction import extremes, rig, scenes
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2
+from thincam_jax.reconstruction.assembly import centred_crop
 from thincam_jax.reconstruction.poisson import (
     LINKS,
     Counts,
@@ -24,7 +25,6 @@ from thincam_jax.reconstruction.poisson import (
 )
 from thincam_jax.reconstruction.problem import backprojected_noise, with_tau
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
-from thincam_jax.reconstruction.recording import centred_crop
 from thincam_jax.reconstruction.regularisers import Sparsity
 from thincam_jax.reconstruction.total_variation import TotalVariation
 

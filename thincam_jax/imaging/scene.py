@@ -220,6 +220,13 @@ class Scene(Module):
                 f"planes have different batch shapes {sorted(batches)}; make them equal"
             )
 
+    def _repr_png_(self) -> bytes:
+        """Picture for notebooks: its planes, axes in mm."""
+        from thincam_jax.plot.frame import as_png
+        from thincam_jax.plot.objects import draw_scene
+
+        return as_png(draw_scene(self))
+
     @classmethod
     def photograph(
         cls,
@@ -231,8 +238,8 @@ class Scene(Module):
     ) -> "Scene":
         """A photograph on a screen: its linear light, upright, colours as a batch (`load_image`).
 
-        - `distance`, `width`: of the screen, mm. `wavelength`: mm, or a `Spectrum`: the light of
-          each colour alike, by default 550 nm.
+        - `distance`, `width`: distance and width of the screen, mm.
+        - `wavelength`: mm, or a `Spectrum`; the light of all colours, by default 550 nm.
         """
         from thincam_jax.imaging.targets.images import load_image  # slow, of other libraries
 

@@ -51,6 +51,13 @@ class LenslessCamera(Module):
     sensor: Sensor = eqx.field(converter=as_sensor)
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
 
+    def _repr_png_(self) -> bytes:
+        """Picture for notebooks: the mask, and the camera from the side."""
+        from thincam_jax.plot.frame import as_png
+        from thincam_jax.plot.objects import draw_camera
+
+        return as_png(draw_camera(self))
+
     def on_grid(self, grid: Grid) -> "LenslessCamera":
         """The camera with the pixels of a grid in place of the sensor's."""
         return replace(self, sensor=Sensor(grid.shape, grid.pitch))

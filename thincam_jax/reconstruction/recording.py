@@ -14,13 +14,12 @@ from jaxtyping import Array, Bool, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
-from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
-from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Stacked
+from thincam_jax.imaging.operators import AbstractOperator, Masked, Stacked
 from thincam_jax.imaging.operators.base import is_shape, shapes_of
-from thincam_jax.imaging.operators.crop_convolution import cut, kernel_shape, window_shape
 from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.reconstruction.assembly import centred_crop, convolution_problem, fitting_field
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.noise import (
@@ -29,7 +28,6 @@ from thincam_jax.reconstruction.noise import (
     is_below_black,
     unseen_variance,
 )
-from thincam_jax.reconstruction.planes import warn_of_equal_planes
 from thincam_jax.reconstruction.problem import Background, InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 from thincam_jax.reconstruction.result import Reconstruction
@@ -173,7 +171,14 @@ class Recording(Module):
             for variance, c in zip(self._variances(matrix, captures, valid), channels, strict=True)
         ]
         pitch = self._pitch(captures[0].dtype)
-        return _convolutions(channels, variances, pitch, self._field(), settings)
+        return convolution_problem(channels, variances, pitch, self._field(), settings)
+
+    def _repr_png_(self) -> bytes:
+        """Picture for notebooks: captures and PSF."""
+        from thincam_jax.plot.frame import as_png
+        from thincam_jax.plot.objects import draw_recording
+
+        return as_png(draw_recording(self))
 
     def reconstruction(
         self, outcome: Outcome, method: str, tau: float | None = None
@@ -378,7 +383,7 @@ class Recording(Module):
             return same_parity(model.pixels or grid.shape, grid.shape)
         kernel = model.psfs.shape[-2:]  # type: ignore[union-attr]
         whole = tuple(s + k - 1 for s, k in zip(sensor, kernel, strict=True))
-        return _fitting_field(model.field_shape or whole, sensor, kernel)  # type: ignore
+        return fitting_field(model.field_shape or whole, sensor, kernel)  # type: ignore
 
     def _channels(self, synthesis, captures, valid) -> tuple[np.ndarray, list[SynthesisRow]]:
         """The channels of a synthesis."""
@@ -415,51 +420,6 @@ def _sums(weights: Float[Array, "sum part"], parts: Float[Array, " part"]):
     return list(jnp.sum(weights * parts, axis=1))
 
 
-def _convolutions(channels, variances, pitch, field_shape, settings) -> InverseProblem:
-    """The problem of convolutions on one window."""
-    dtype = channels[0].capture.dtype
-    windows = [
-        window_shape(
-            c.capture.shape[-2:],
-            field_shape,
-            _kernel_extent(c.kernel, c.capture.shape[-2:], field_shape),
-        )
-        for c in channels
-    ]
-    window = (max(w[0] for w in windows), max(w[1] for w in windows))
-    # Captures, kernels and a field, each with its transform, at the least.
-    refuse_if_too_large(
-        f"a reconstruction on a field of {field_shape[0]}×{field_shape[1]} pixels",
-        dtype.itemsize * math.prod(window) * (2 * len(channels) + 3),
-        "give a smaller field_shape, fewer pixels or fewer captures",
-    )
-    operators = [
-        CropConvolution(
-            c.kernel.astype(dtype),
-            pitch.astype(dtype),
-            c.capture.shape[-2:],
-            field_shape,
-            summed=1,
-            window=window,
-        )
-        for c in channels
-    ]
-    weights = [
-        (1.0 if c.valid is None else c.valid.astype(dtype)) / v
-        for c, v in zip(channels, variances, strict=True)
-    ]
-    warn_of_equal_planes(operators, weights)
-    return InverseProblem(operators, [c.capture for c in channels], weights=weights, **settings)
-
-
-def centred_crop(
-    image: Float[Array, "*batch y x"], shape: Sequence[int]
-) -> Float[Array, "*batch v u"]:
-    """The central part of an image, of this shape."""
-    corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
-    return cut(image, corner, shape)
-
-
 def _single_captures(operator: AbstractOperator) -> list[AbstractOperator]:
     """An operator of several captures as operators of one each, with their masks and gains."""
     if isinstance(operator, Stacked):
@@ -480,18 +440,3 @@ def _flat(parts: Any) -> Any:
 def _no_synthesis(synthesis, what: str) -> None:
     if synthesis is not None:
         raise ValueError(f"a synthesis needs Cameras; leave it out with {what}")
-
-
-def _kernel_extent(kernel, sensor, field_shape) -> tuple[int, int]:
-    """Kernel extent that reaches the sensor from the field."""
-    most = kernel_shape(sensor, field_shape)
-    rows, columns = (min(k, m) for k, m in zip(kernel.shape[-2:], most, strict=True))
-    return rows, columns
-
-
-def _fitting_field(field_shape, sensor, kernel) -> tuple[int, int]:
-    """The field, smaller by one where its centre would not fit the sensor's and PSF's samples."""
-    shape = checks.shape2d("field_shape", field_shape)
-    sizes = zip(shape, sensor, kernel, strict=True)
-    rows, columns = (max(f - (s + f - 1 - k) % 2, 1) for f, s, k in sizes)
-    return rows, columns
