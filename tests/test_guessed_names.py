@@ -11,7 +11,13 @@ from thincam_jax.units import deg, nm, um
 pytestmark = pytest.mark.thorough
 
 
-def test_an_fza_capture_and_its_image():
+@pytest.fixture
+def precision_of_a_user():
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+def test_an_fza_capture_and_its_image(precision_of_a_user):
     mask = tc.FresnelZoneAperture(beta=17.0, width=4.0)
     sensor = tc.Sensor(shape=(64, 80), pitch=64 * um)
     camera = tc.LenslessCamera(mask=mask, sensor=sensor, distance=6.5)
@@ -45,7 +51,7 @@ def test_the_gradient_of_an_mtf_in_beta():
     np.testing.assert_allclose(slope, expected, rtol=1e-4)
 
 
-def test_a_screen_calibrated_by_hadamard_patterns_in_memory():
+def test_a_screen_calibrated_by_hadamard_patterns_in_memory(precision_of_a_user):
     wg, calibration = tc.waveguide, tc.measured.calibration
     hologram = wg.VolumeHologram.record(
         532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02

@@ -70,8 +70,9 @@ def record(
         capture(one, scene, noise=noise, key=k, model=model)
         for one, k in zip(cameras, keys, strict=True)
     ]
-    known = isinstance(noise, GaussianNoise) and not any(map(checks.is_traced, captures))
-    variances = [float(np.mean(noise.variance(c))) for c in captures] if known else None
+    variances = None
+    if isinstance(noise, GaussianNoise) and not checks.holds_traced(captures):
+        variances = [float(np.mean(noise.variance(one))) for one in captures]
     if not checks.holds_traced(scene, cameras):
         covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]
         widest = np.minimum(np.max(covers, axis=0), optics.seen_field)

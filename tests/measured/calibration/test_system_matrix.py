@@ -51,6 +51,16 @@ def test_the_matrix_comes_back(series, dtype, tmp_path):
     np.testing.assert_allclose(found.matrix, TRUTH, atol=1e-5)
 
 
+@pytest.mark.parametrize("series", SERIES, ids=lambda s: f"{s.order}-{s.display}")
+def test_captures_of_a_series_alone_stay_in_memory(series, tmp_path):
+    """The frames, and so the matrix, are those that a store would have had."""
+    operator, noise = Matrix(TRUTH, CELLS, SHAPE), {"deviation": 0.1, "offset": 3.0}
+    kept = simulate_captures(series, operator, jax.random.key(5), **noise)
+    stored = simulated(tmp_path, series, **noise)
+    np.testing.assert_array_equal(kept.rows(3, 7), stored.rows(3, 7))
+    np.testing.assert_array_equal(recover_matrix(kept).matrix, recover_matrix(stored).matrix)
+
+
 def test_without_dark_frames_the_offset_is_in_the_first_cell(tmp_path):
     captures = simulated(tmp_path, HadamardSeries(CELLS, display="binary"), offset=3.0)
     expected = TRUTH + 3.0 * (np.arange(32) == 0)

@@ -261,7 +261,7 @@ def simulate_captures(
         for number, image in zip(numbers, images, strict=True):
             store.write(number, image) if store else kept.append(image)
     if store is None:
-        return dataclasses.replace(captures, frames=np.stack(kept))
+        return dataclasses.replace(captures, frames=np.stack(kept).astype(np.float32))
     store.close()
     return HadamardCaptures.load(captures.path)
 
