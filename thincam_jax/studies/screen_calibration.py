@@ -52,7 +52,7 @@ class Calibration:
 
     - `order`, `display`, `dark_frames`: see `HadamardSeries`. `bits`: bits of the camera.
     - `exposure`: part of the camera's range that a white monitor fills; `offset`: its dark level
-      and `noise`: standard deviation of its white noise, in counts.
+      and `noise_std`: standard deviation of its white noise, in counts.
     - `keep_captures`: leave the stores of captures in the folder that is given.
     - `glass_thickness`: assumed before the fit, mm; None for the true one.
     - `fitted`: the parameters that are found, keys of `measured.calibration.screen_fit.PARAMETERS`.
@@ -67,7 +67,7 @@ class Calibration:
     bits: Annotated[int, whole(4, 16)] = 12
     exposure: Annotated[float, quantity(positive=True, most=1.0)] = 0.9
     offset: Annotated[float, quantity("counts", non_negative=True)] = 0.0
-    noise: Annotated[float, quantity("counts", non_negative=True)] = 0.0
+    noise_std: Annotated[float, quantity("counts", non_negative=True)] = 0.0
     keep_captures: bool = False
     glass_thickness: Annotated[float | None, GLASS] = None
     fitted: Annotated[tuple[str, ...], choice(PARAMETERS, many=True)] = DEFAULT
@@ -143,7 +143,7 @@ def measure_matrix(
                     writer,
                     Scaled(Sparse(table, plane.shape, frame), counts),
                     jax.random.fold_in(key, number) if number else key,
-                    noise_std=calibration.noise,
+                    noise_std=calibration.noise_std,
                     offset=calibration.offset,
                 )
             measured.append(measuring.recover_matrix(captures))
@@ -308,7 +308,7 @@ class CalibrationRun:
         noise = self.columns["measured"] - self.columns["exact"]
         rounding = 1 / 12  # variance of whole numbers, in counts
         of_a_cell = 2 if options.display == "complementary" else 4
-        spread = of_a_cell * (options.noise**2 + rounding) / math.prod(self.study.plane.shape)
+        spread = of_a_cell * (options.noise_std**2 + rounding) / math.prod(self.study.plane.shape)
         scores = CalibrationScores(
             options.series(self.study.plane.shape).frame_count * len(self.study.cameras),
             round(self._seconds, 2),

@@ -32,7 +32,7 @@ models:
 calibration:
   bits: 10
   offset: 20
-  noise: 1
+  noise_std: 1
   glass_thickness: 5.3 mm
   fitted: [glass_thickness]
   distances: [450 mm]
