@@ -67,6 +67,8 @@ _COARSER, _ROUGH = 2, 3e-3
 _CALMER = 0.92
 # Share of the iterations that a biased camera spends without its uniform light.
 _FIRST_PART = 0.4
+# Tolerance below which the objective ends a run by its square.
+_FINE = 1e-4
 # Iterations after which an image that has not converged tells of light from outside as well.
 _SETTLED = 100
 
@@ -269,8 +271,8 @@ class AdmmTV(AbstractRegularised):
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: sums of captures in place of the captures, see
       `thincam_jax.reconstruction.synthesis`; for `Cameras` only.
-    - `iterations`: at most. `tolerance`: relative residuals at which they end; a tenth of a
-      percent, ten times as much, of the objective over 20 iterations ends them as well.
+    - `iterations`: at most. `tolerance`: relative residuals at which they end. So does a change
+      of the objective over 20 iterations by a tenth of a percent, of less as the square of less.
 
     **Errors**: ValueError, one line, for values out of range.
 
@@ -370,7 +372,8 @@ class AdmmTV(AbstractRegularised):
         half, planes = (self.iterations - done) // 2, problem.image_shape[-3]
         until = done + (min(_BALANCED, half) if planes == 1 else half)
         limits = self.iterations, self.tolerance
-        settled = 10 * self.tolerance
+        # About its minimum the objective changes by the square of the image's change.
+        settled = 10 * self.tolerance * min(1.0, self.tolerance / _FINE)
         schedule = Schedule(*limits, adapt_until=until, done=done, settled=settled)
         method = in_parallel(problem, functools.partial(admm_method, near=near))
         return iterate(method, image, schedule, callback=callback)
