@@ -29,10 +29,12 @@ def positional(name: str) -> list[inspect.Parameter]:
 
 
 def is_plain(annotation: object) -> bool:
-    """Whether it allows a number, a text, a truth value or a tuple of them."""
+    """Whether it is a number, a text, a truth value or a tuple of them, and not also an object."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin in (typing.Union, types.UnionType, typing.Annotated):
-        return any(map(is_plain, parts))
+    if origin in (typing.Union, types.UnionType):
+        return all(is_plain(one) for one in parts if one is not types.NoneType)
+    if origin is typing.Annotated:
+        return is_plain(parts[0])
     return origin in (tuple, typing.Literal) or (
         isinstance(annotation, type) and issubclass(annotation, PLAIN)
     )
@@ -51,4 +53,4 @@ def test_options_are_given_by_name(name):
 
 def test_the_check_finds_plain_options():
     assert is_plain(int) and is_plain(float | None) and is_plain(tuple[int, int] | None)
-    assert not is_plain(tc.Wiener | None) and not is_plain(tc.Scene)
+    assert not is_plain(tc.Wiener | str | None) and not is_plain(tc.Scene)
