@@ -103,7 +103,7 @@ def exposures(psf):
         yield scene, light + light.std() * 10**-1.5 * noise
 
 
-def climb(quality, start, steps=(10**0.5, 10**0.25)):
+def climb(quality, start, steps):
     """(best quality, settings) by factors of one setting at a time, from coarse to fine."""
     seen = {}
 
@@ -128,8 +128,11 @@ def climb(quality, start, steps=(10**0.5, 10**0.25)):
     return value(best), best
 
 
-def best_of(method, scene, capture, psf, start=START, iterations=(100, 300), **options):
-    """Tuned PSNR for each number of iterations, and the settings of the last."""
+STEPS = 10**0.5, 10**0.25
+
+
+def best_of(method, scene, capture, psf, start=START, iterations=(100, 300), steps=STEPS):
+    """Tuned PSNR for each number of iterations, later ones coarsely, and the last settings."""
     scores = []
     for count in iterations:
 
@@ -138,7 +141,7 @@ def best_of(method, scene, capture, psf, start=START, iterations=(100, 300), **o
                 image = method(capture, psf, settings, count)
             return score(image, scene) if np.isfinite(image).all() else -np.inf
 
-        found, start = climb(quality, start, **options)
+        found, start = climb(quality, start, steps if count == iterations[0] else steps[:1])
         scores.append(found)
     return scores, start
 
@@ -148,6 +151,8 @@ def say(capsys, *cells):
         print("\n| " + " | ".join(str(cell) for cell in cells) + " |", end="", flush=True)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of scico and lensless at import
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("kind", [RIGHT, "blurred", "shaded"])
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_reconstruction(camera, kind, capsys):
@@ -168,31 +173,30 @@ def test_reconstruction(camera, kind, capsys):
             name = "LenslessPiCam ADMM"
             found[name], settings[name] = best_of(others.lensless_picam, scene, capture, model)
         if there("scico") and kind == RIGHT:
-            start = settings.get("scico DnCNN", (0.1, 1e-3))
-            for name, (scores, last) in scicos(scene, capture, model, best, start):
+            dncnn = settings.get("scico DnCNN")
+            for name, (scores, last) in scicos(scene, capture, model, best, dncnn):
                 found[name], settings[name] = scores, last
         for name, scores in found.items():
-            rows.setdefault(name, []).append(" / ".join(f"{value:.2f}" for value in scores))
+            cell = " / ".join(f"{value:.2f}" for value in scores)
+            rows.setdefault(name, []).append(cell)
     for name, scores in rows.items():
-        last = settings.get(name, "default")
-        say(capsys, camera, kind, name, *scores, last)
+        last = " ".join(f"{value:.2g}" for value in np.atleast_1d(settings.get(name, ())))
+        say(capsys, camera, kind, name, *scores, last or "default")
 
 
-def scicos(scene, capture, psf, best, start):
-    """ADMM with NumPy's settings, as its iteration is the same, or near them; DnCNN from `start`.
+def scicos(scene, capture, psf, best, dncnn):
+    """ADMM with NumPy's settings, as its iteration is the same; DnCNN tuned, or as for a picture.
 
-    An iteration takes too long for a search of all three settings.
+    An iteration takes too long for a search of all settings for every picture.
     """
-    weight, *factors = best
-
-    def admm(capture, psf, settings, count):
-        return others.scico(capture, psf, (settings[0], *factors), count)
-
     with jax.enable_x64(False):
-        scores, last = best_of(admm, scene, capture, psf, (weight,), steps=(10**0.25,))
-        yield "scico ADMM", (scores, (*last, *factors))
-        options = {"iterations": (30,), "steps": (10**0.5,)}
-        yield "scico DnCNN", best_of(others.scico_dncnn, scene, capture, psf, start, **options)
+        images = [others.scico(capture, psf, best, count) for count in (100, 300)]
+        yield "scico ADMM", ([score(image, scene) for image in images], best)
+        found = [score(others.scico_dncnn(capture, psf, dncnn, 30), scene)] if dncnn else None
+        if not found:
+            options = {"iterations": (30,), "steps": (10**0.5,)}
+            found, dncnn = best_of(others.scico_dncnn, scene, capture, psf, (0.1, 3e-3), **options)
+        yield "scico DnCNN", (found, dncnn)
 
 
 def there(package):
@@ -210,6 +214,8 @@ METHODS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("name", METHODS)
 def test_reconstruction_time(name, capsys, tmp_path):
     """CPU and wall seconds: a new process to its first image, then warm, least to most of five."""
