@@ -162,6 +162,8 @@ def test_reconstruction(camera, kind, capsys):
     model, rows, settings = wrong(truth, kind), {}, {}
     for scene, capture in exposures(truth):
         own = {"AdmmTV()": others.thincam("AdmmTV"), "PlugAndPlay()": others.thincam("PlugAndPlay")}
+        for rule in ("sure", "discrepancy"):
+            own[f"AdmmTV, τ {rule}"] = others.thincam("AdmmTV", tau=rule)
         found = {name: [score(method(capture, model), scene)] for name, method in own.items()}
         tuned = [others.thincam("AdmmTV", tau=tau)(capture, model) for tau in TAUS]
         values = [score(image, scene) for image in tuned]
