@@ -54,7 +54,7 @@ def test_the_matrix_comes_back(series, dtype, tmp_path):
 @pytest.mark.parametrize("series", SERIES, ids=lambda s: f"{s.order}-{s.display}")
 def test_captures_of_a_series_alone_stay_in_memory(series, tmp_path):
     """The frames, and so the matrix, are those that a store would have had."""
-    operator, noise = Matrix(TRUTH, CELLS, SHAPE), {"deviation": 0.1, "offset": 3.0}
+    operator, noise = Matrix(TRUTH, CELLS, SHAPE), {"noise_std": 0.1, "offset": 3.0}
     kept = simulate_captures(series, operator, jax.random.key(5), **noise)
     stored = simulated(tmp_path, series, **noise)
     np.testing.assert_array_equal(kept.rows(3, 7), stored.rows(3, 7))
