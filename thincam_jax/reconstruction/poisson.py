@@ -195,7 +195,9 @@ class PoissonTV(AbstractIterativeSolver):
             tolerance=self.tolerance,
         )
         result = recording.reconstruction(outcome, self.name, float(self.tau))
-        wide, beyond = beyond_field(recording, recording.problem(), outcome.image, None)
+        wide, beyond = None, ""
+        if isinstance(model, Cameras) and problem.image_shape[-3] == 1:  # with noise that is found
+            wide, beyond = beyond_field(recording, recording.problem(), outcome.image, None)
         if wide is not None:
             result = self.solve(wide, start=start)
         return saying(result, beyond, result.reason)
