@@ -220,10 +220,11 @@ def iterate(
                 best = current
             history.append(progress)
             small = max(progress.primal, progress.dual) < schedule.tolerance
+            is_stopped = callback is not None and callback(progress)
             if small or _settled(history, schedule.settled):
                 status = "converged"
                 break
-            if callback is not None and callback(progress):
+            if is_stopped:
                 status = "stopped"
                 break
             if done <= schedule.adapt_until and falling:

@@ -69,7 +69,7 @@ _CALMER = 0.92
 _FIRST_PART = 0.4
 # Tolerance below which the objective ends a run by its square.
 _FINE = 1e-4
-# Iterations after which an image that has not converged tells of light from outside as well.
+# Iterations after which an image that has not converged tells of misfit as well.
 _SETTLED = 100
 
 
@@ -239,9 +239,8 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
-        wide, beyond, ended = None, "", outcome.status
-        settled = ended == "iterations_exhausted" and outcome.iterations >= _SETTLED
-        if ended == "converged" or settled:
+        wide, beyond = None, ""
+        if _is_settled(outcome):
             wide, beyond = beyond_field(recording, problem, outcome.image, self.synthesis)
         if wide is not None:
             again = self.solve(wide, start=start, callback=callback)
@@ -253,6 +252,12 @@ class AbstractRegularised(AbstractIterativeSolver):
         result = recording.reconstruction(outcome, self.name, float(problem.tau))
         said = "" if beyond and outcome.reason.endswith(RESIZE) else outcome.reason
         return saying(result, reason, said, beyond)
+
+
+def _is_settled(outcome: Outcome) -> bool:
+    """Whether what an image leaves is misfit, not what more iterations would explain."""
+    done = outcome.status == "iterations_exhausted" and outcome.iterations >= _SETTLED
+    return done or outcome.status == "converged"
 
 
 class AdmmTV(AbstractRegularised):
@@ -307,8 +312,7 @@ class AdmmTV(AbstractRegularised):
         if given:
             return self._by_admm(problem, image, callback)
         outcome = self._by_levels(problem, image, callback, _COARSER)
-        is_done = outcome.status in ("converged", "iterations_exhausted")
-        misfit = misfit_of(problem, outcome.image) if is_done else None
+        misfit = misfit_of(problem, outcome.image) if _is_settled(outcome) else None
         if misfit is None:
             return outcome
         if misfit.is_suspect:
