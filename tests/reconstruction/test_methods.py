@@ -386,7 +386,8 @@ def cosines(noise=0.02):
     seen = scipy.signal.convolve2d(truth, kernel, mode="valid")
     seen += noise * np.random.default_rng(2).normal(size=seen.shape)
     psfs = tc.Psfs(jnp.asarray(kernel)[None], field_shape=shape)
-    return tc.Recording(jnp.asarray(seen)[None], psfs, noise_variance=noise**2), truth
+    known = {"noise_variance": noise**2, "background": 0.0}
+    return tc.Recording(jnp.asarray(seen)[None], psfs, **known), truth
 
 
 @pytest.mark.thorough

@@ -196,7 +196,8 @@ def test_poisson_of_many_counts_is_total_variation_of_gaussian_noise(mean, gap):
     assert likely.tau == 2.0 and likely.method == "poisson" and likely.status == "converged"
     gaps = {}
     for tau in (1.4, 2.0, 2.8):
-        gaussian = tc.Recording(captures - background, psfs, noise_variance=captures.mean())
+        known = {"noise_variance": captures.mean(), "background": 0.0}
+        gaussian = tc.Recording(captures - background, psfs, **known)
         squares = tc.reconstruct(gaussian, tc.AdmmTV(tau, iterations=600, tolerance=1e-5))
         seen = (centred_crop(jnp.asarray(r.image), captures.shape[-2:]) for r in (likely, squares))
         gaps[tau] = relative_l2(*seen)

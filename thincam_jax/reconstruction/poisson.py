@@ -14,7 +14,6 @@ that E has a gradient. At high counts this agrees with least squares of weights 
 counts a pixel it does not.
 """
 
-import dataclasses
 import functools
 import time
 from collections.abc import Sequence
@@ -181,7 +180,7 @@ class PoissonTV(AbstractIterativeSolver):
         # The variance is that of the counts, and need not be estimated.
         counted = recording.with_noise(1.0)
         if recording.background is None:  # the solver's own is known
-            counted = dataclasses.replace(counted, background=0.0)
+            counted = counted.with_background(0.0)
         counted = covering(counted, start)
         problem = counted.problem(tau=self.tau, regulariser=self.variation)
         image = None

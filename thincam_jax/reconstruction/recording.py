@@ -225,6 +225,11 @@ class Recording(Module):
         none = {"is_leaf": lambda leaf: leaf is None}
         return eqx.tree_at(lambda recording: recording.noise_variance, self, noise_variance, **none)
 
+    def with_background(self, background: Any) -> "Recording":
+        """This recording with a known background; its captures are not examined again."""
+        known, none = self._backgrounds(background), {"is_leaf": lambda x: x is None}
+        return eqx.tree_at(lambda recording: recording.background, self, known, **none)
+
     def focused(self, object_distance: Numbers | Sequence[Number]) -> "Recording":
         """This recording with its `Cameras` focused on another distance, mm."""
         if not isinstance(self.imaging_model, Cameras):
