@@ -289,7 +289,7 @@ def reference(x):
 
 
 def field_behind(x):
-    """The mask's field on samples, those at its edge weighted by what of them is open."""
+    """The mask's field on samples; one at its edge counts by the part of it that is open."""
     step = x[1] - x[0]
     opened = np.clip((WIDTH / 2 - np.abs(x)) / step + 0.5, 0, 1)
     squared = x[:, None] ** 2 + x**2

@@ -41,9 +41,21 @@ def test_a_recording_shows_captures_and_the_psf():
     others = (
         tc.Recording(RNG.random((5, 24, 32)), tc.Psfs(RNG.random((5, 9, 9)))),
         tc.Recording([RNG.random((3, 24, 32))], operator),
+        tc.Recording([RNG.random((24, 32))], tc.Cameras([CAMERA])),  # for fringe scanning
     )
     shown = [titles(draw_recording(one)) for one in others]
-    assert shown == [[*(f"capture {n} of 5" for n in (1, 2, 3)), "PSF"], ["capture"]]
+    assert shown == [[*(f"capture {n} of 5" for n in (1, 2, 3)), "PSF"], ["capture"], ["capture"]]
+
+
+def test_the_psf_shown_is_that_of_the_first_camera():
+    """Alone computed, from the nearest distance."""
+    scene = tc.Scene(tc.ImagePlane(RNG.random((8, 12)), 250.0, 60.0), 550 * nm)
+    recording = tc.record([CAMERA, CAMERA.replace(distance=6.0)], scene)
+    shown = np.asarray(draw_recording(recording).axes[-1].images[0].get_array())
+    optics = tc.Cameras([CAMERA], wavelength=550 * nm, object_distance=250.0)
+    kernel = np.asarray(optics.kernels((24, 32), [1.0])[0][0, 0])
+    assert shown.shape == kernel.shape
+    assert np.corrcoef(shown.ravel(), kernel.ravel())[0, 1] > 0.9
 
 
 def test_all_of_them_show_themselves():

@@ -57,11 +57,16 @@ def draw_recording(recording: Recording) -> matplotlib.figure.Figure:
         shown.append((title, capture))
     if isinstance(model, Psfs):
         shown.append(("PSF", np.asarray(model.psfs)[0].reshape(-1, *model.psfs.shape[-2:])[0]))
-    elif isinstance(model, Cameras) and not model.over_field:
-        shape = model.cameras[0].sensor.shape
-        shown.append(("PSF", model.kernels(shape, [1.0] * model.count)[0][0, 0]))
+    elif isinstance(model, Cameras) and not model.over_field and _is_lit(model):
+        nearest = np.atleast_1d(np.asarray(model.object_distance, dtype=object))[0]
+        shown.append(("PSF", model.own_psf(0, model.cameras[0].sensor.shape, nearest)))
     figure, panels = drawing((3.2 * len(shown), 3.2), 1, len(shown), squeeze=False)
     for axes, (title, image) in zip(panels[0], shown, strict=True):
         show_image(axes, eight_bit(pictures(image)[0]), pitch, vmin=0, vmax=255)
         axes.set_title(title, fontsize=9)
     return figure
+
+
+def _is_lit(model: Cameras) -> bool:
+    """Whether light and distance are known, which fringe scanning does not need."""
+    return model.wavelength is not None and model.object_distance is not None

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Numbers, Shape
+from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity, unchecked
@@ -232,12 +232,18 @@ class Cameras(Module):
         distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
         if not distances.size:
             raise ValueError("object_distance is empty; give one in mm, or one for each plane")
-        kernels, method = [], as_method(self.model, self.pixel_integration)
-        for camera, colours, ratio in zip(self.cameras, self.colours, ratios, strict=True):
-            grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
-            planes = [spectral_psf(camera, colours, d, method, grid) for d in distances]
+        kernels = []
+        for number, ratio in zip(range(self.count), ratios, strict=True):
+            own = own_field(field, ratio)
+            planes = [self.own_psf(number, own, distance) for distance in distances]
             kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
         return kernels
+
+    def own_psf(self, number: int, field: tuple[int, int], distance: Number) -> Float[Array, "k l"]:
+        """PSF of a camera on its own scale, on all pixels by which a field reaches its sensor."""
+        camera, method = self.cameras[number], as_method(self.model, self.pixel_integration)
+        grid = kernel_grid(camera.sensor.grid, field)
+        return spectral_psf(camera, self.colours[number], distance, method, grid)
 
 
 _PSF_SHAPE = (

@@ -20,10 +20,8 @@ from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.imaging.operators.crop_convolution import kernel_grid, kernel_shape
+from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.method import as_method
-from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.reconstruction.imaging_model import (
     Cameras,
     Psfs,
@@ -116,12 +114,10 @@ class WienerSynthesis(eqx.Module):
             next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in matrix
         )
         object_distance = cameras.object_distance
-        method = as_method(cameras.model, cameras.pixel_integration)
         kernels, uniform = [], []
-        for camera, colours, ratio in zip(each, cameras.colours, capture_ratios, strict=True):
+        for number, ratio in enumerate(capture_ratios):
             own = own_field(self.field_shape, ratio)
-            grid = kernel_grid(sensor, own)
-            h = spectral_psf(camera, colours, object_distance, method, grid)
+            h = cameras.own_psf(number, own, object_distance)
             kernels.append(h)
             cover = jnp.asarray(_coverage(own, self.field_shape, ratio), dtype=h.dtype)
             uniform.append(_convolve(CropConvolution(h, sensor.pitch, sensor.shape, own), cover))
