@@ -84,6 +84,8 @@ def test_counts_of_a_scene_beyond_the_sensors_field():
     counts = dataclasses.replace(recording, captures=[electrons.astype(float)])
     result: Any = tc.reconstruct(counts, tc.PoissonTV())
     assert "the image has field_shape=" + str(result.image.shape) in result.reason
+    again: Any = tc.reconstruct(counts, tc.PoissonTV(iterations=20), start=result.image)
+    assert again.image.shape == result.image.shape
     kept: Any = tc.reconstruct(with_field(counts, SHAPE), tc.PoissonTV())
     assert likeness(result, plane, SHAPE) > likeness(kept, plane) + 0.02
 

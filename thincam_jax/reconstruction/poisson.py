@@ -170,6 +170,7 @@ class PoissonTV(AbstractIterativeSolver):
     ):
         if callback is not None:
             raise ValueError("method 'poisson' runs in one piece; leave out the callback")
+        recording = covering(recording, start)
         model = recording.imaging_model
         if isinstance(model, Cameras) and not model.over_field:
             if max(distance_ratios(model.cameras)) > 1:
@@ -181,7 +182,6 @@ class PoissonTV(AbstractIterativeSolver):
         counted = recording.with_noise(1.0)
         if recording.background is None:  # the solver's own is known
             counted = counted.with_background(0.0)
-        counted = covering(counted, start)
         problem = counted.problem(tau=self.tau, regulariser=self.variation)
         image = None
         if start is not None:
