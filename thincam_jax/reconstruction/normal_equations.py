@@ -122,10 +122,7 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
     convolved = convolutions(fixed)
-    powers = None
-    if convolved is not None:
-        powers = mean_powers(convolved, fixed.weights)
-        powers = _less_uniform(fixed, powers) if fixed.has_background else powers
+    powers = None if convolved is None else mean_powers(convolved, fixed.weights)
     return IterativeNormal(problem, shift, powers=powers)
 
 
@@ -246,7 +243,9 @@ class IterativeNormal(AbstractNormal):
 
     def _filter(self):
         if self.powers is not None:
-            return functools.partial(_filtered, self.inverse_filter())
+            left = self.problem.has_background and self.powers.shape[1] == 1
+            powers = less_uniform(self.problem, self.powers) if left else self.powers
+            return functools.partial(_filtered, replace(self, powers=powers).inverse_filter())
         return self.modes and functools.partial(_by_modes, self.modes, self.shift)
 
     def least_squares(
@@ -355,14 +354,12 @@ def mean_powers(
 
 
 @jax.jit
-def _less_uniform(problem: InverseProblem, powers: Complex[Array, "channel p q v u"]):
+def less_uniform(problem: InverseProblem, powers: Complex[Array, "channel p q v u"]):
     r"""Eigenvalues without the part of uniform light on the sensor, which is the background's.
 
     :math:`A^Tw 1 1^TwA / 1^Tw1` of n pixels has the nearest circulant eigenvalues
-    :math:`|F A^T w 1|^2 / (n\, 1^T w 1)`. Of one plane; several keep theirs.
+    :math:`|F A^T w 1|^2 / (n\, 1^T w 1)`, of one plane.
     """
-    if powers.shape[1] > 1:
-        return powers
     lost, window = 0.0, padded_field(problem.field_shape)
     for operator, weight in _weighted(problem):
         pixels = jnp.mean(weight, axis=tuple(range(weight.ndim - 2)))
