@@ -78,8 +78,8 @@ def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
     """Rows and columns of the grid, denser at the edges of the shadow."""
     pitch, scale = float(grid.pitch), float(path.magnification)
     # Of the whole grid the sum would be compiled for each of its shapes.
-    corner = SparseGrid(*(np.array([(1 - count) / 2]) for count in grid.shape), grid.pitch)
-    shadow = path.on_mask(corner, mask.centre)
+    top, left = (np.array([(1 - count) / 2]) for count in grid.shape)
+    shadow = path.on_mask(SparseGrid(top, left, grid.pitch), mask.centre)
     zone = 3 * math.sqrt(float(path.wavelength * path.distance) * scale) / pitch
     found = []
     for axis, count in enumerate(grid.shape):
