@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import lineax
 import numpy as np
 import optimistix
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
@@ -205,10 +205,16 @@ class IterativeNormal(AbstractNormal):
     """Solutions by conjugate gradients to `INNER_TOLERANCE`.
 
     Convolutions are preconditioned by their `mean_powers`, separable cameras by the `modes` given.
+    Captures that are not `lit` have no background.
     """
 
     modes: SeparableModes | None = None
     powers: Complex[Array, "channel p q v u"] | None = None
+    lit: tuple[Bool[Array, "..."], ...] | None = None
+
+    def applied(self, image: Float[Array, "..."]):
+        seen = tuple(forward(operator, image) for operator in self.problem.operators)
+        return back_projected(self.problem, seen, self.lit) + self.shift * image
 
     def solve(self, right: Float[Array, "..."]):
         return self(right, jnp.zeros_like(right))
@@ -232,10 +238,11 @@ class IterativeNormal(AbstractNormal):
         operator = lineax.FunctionLinearOperator(
             lambda image: factor * self.applied(image), structure, tags
         )
+        # They decide how the solution is found: it has its slopes by the equation alone.
+        fixed, guess, size = jax.lax.stop_gradient((self, guess, jnp.sqrt(jnp.mean(right**2))))
         options: dict[str, Any] = {"y0": guess / factor}
-        if (filtered := self._filter()) is not None:
+        if (filtered := fixed._filter()) is not None:
             options["preconditioner"] = lineax.FunctionLinearOperator(filtered, structure, tags)
-        size = jnp.sqrt(jnp.mean(right**2))
         limits: dict[str, Any] = {"rtol": tolerance, "atol": tolerance * size}
         solver = lineax.CG(**limits, norm=optimistix.rms_norm, max_steps=steps)
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
