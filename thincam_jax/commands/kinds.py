@@ -44,29 +44,41 @@ class Kind:
 # By the `kind` of their files; a study's file does not name it.
 KINDS = {
     "study": Kind(
-        *("a study", "run", "sections:StudyConfig", "explain:psfs", "quick"),
+        *("a study", "run", "sections:StudyConfig", "study.build:psfs", "quick"),
         *("study.build:build_study", "study.run:run_study"),
     ),
     "refocus": Kind(
-        *("a refocusing", "run", "refocus:RefocusConfig", "explain:psfs", "fza_refocus"),
+        *("a refocusing", "run", "refocus:RefocusConfig", "study.build:psfs", "fza_refocus"),
         *("refocus:build_refocus", "refocus:run_refocus"),
     ),
     "screen": Kind(
-        *("a see-through screen", "run", "screen.config:ScreenConfig", "explain:rays"),
+        *("a see-through screen", "run", "screen.config:ScreenConfig", "screen.run:rays"),
         *("sts_camera", "screen.run:build_screen", "screen.run:run_screen"),
     ),
     "design": Kind(
-        *("a design", "design", "design.config:DesignConfig", "explain:search", "design_distances")
+        *(
+            "a design",
+            "design",
+            "design.config:DesignConfig",
+            "design.build:search",
+            "design_distances",
+        )
     ),
     "capture": Kind(
-        *("a capture", "capture", "capture.config:CaptureConfig", "explain:frames", "rig_virtual")
+        *(
+            "a capture",
+            "capture",
+            "capture.config:CaptureConfig",
+            "capture.command:frames",
+            "rig_virtual",
+        )
     ),
     "learned": Kind(
-        *("a network", "train", "learned.refocusing:LearnedConfig", "explain:lessons"),
+        *("a network", "train", "learned.refocusing:LearnedConfig", "learned.training:lessons"),
         *("learned_refocus", "learned.refocusing:build_lessons", "learned.refocusing:run_training"),
     ),
     "denoiser": Kind(
-        *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "explain:lessons"),
+        *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "learned.training:lessons"),
         *("denoiser", "learned.denoiser:build_lessons", "learned.denoiser:run_denoiser"),
     ),
 }

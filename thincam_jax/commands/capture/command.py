@@ -295,3 +295,10 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         read_json(seconds) if seconds.is_file() else {},
         calibration,
     )
+
+
+def frames(asked: Any, setup: Any) -> Iterator[str]:
+    """Frames of a capture, and the time that they are exposed."""
+    plan = build_plan(asked) if setup is None else setup
+    seconds = sum(plan.settings[step.settings].exposure for step in plan.steps)
+    yield f"{len(plan.steps)} frames, exposed for {seconds:.3g} s in all"

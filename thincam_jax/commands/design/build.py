@@ -1,5 +1,8 @@
 """Study of a design's file, and a study's file of the designs found."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
 from thincam_jax._core.precision import allow
@@ -242,4 +245,26 @@ def _method_config(config: DesignConfig, method: Method) -> MethodConfig:
     )
     return MethodConfig.model_construct(
         name=method.name, kind=method.solver.name, synthesis=method.synthesis, shots=shots
+    )
+
+
+def search(asked: Any, setup: Any) -> Iterator[str]:
+    """PSFs of the design to beat, and evaluations of a design's search."""
+    asks, shots = asked.search, asked.reference.shots
+    exposures = asked.design(asked.reference).exposures
+    cameras = exposures.cameras(asked.sensor.build(), asked.mask.build(beta=1.0))
+    words = (f"β {exposure.beta:g} rad/mm²" for exposure in exposures)
+    found = list(zip(cameras, exposures, words, strict=True))
+    yield from build.psf_costs(asked, found, asked.object.distance)
+    finely = asks.frequencies
+    most = asks.samples + asks.starts * asks.steps
+    yield (
+        f"search: {asks.samples} samples, {asks.starts} descents of at most {asks.steps} "
+        f"steps: at most {most} evaluations and their gradients at {finely.radii}×"
+        f"{finely.directions} frequencies of {len(shots)} shots"
+    )
+    again = asked.validation
+    yield (
+        f"validation: {again.best} found designs, the design to beat and {len(asked.compare)} "
+        f"others, on {len(asked.targets)} targets, noise of {again.seeds} seeds"
     )

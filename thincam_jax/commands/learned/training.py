@@ -1,6 +1,6 @@
 """Trainings in a folder, and the sources of their images, of all kinds that learn."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -121,3 +121,13 @@ class InFolder:
             return train(network, lessons, options, **place)
         except CheckpointError as error:
             raise ConfigError(str(error)) from None
+
+
+def lessons(asked: Any, setup: Any) -> Iterator[str]:
+    """Steps and checks of a training."""
+    training = asked.training
+    checks = training.steps // training.check_every
+    yield (
+        f"training: {training.steps} steps of {training.batch} examples, {checks} checks on "
+        f"{training.judged} batches"
+    )

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from thincam_jax._core import checks
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
-from thincam_jax.commands.reconstruct.command import METHODS
+from thincam_jax.commands.reconstruct import METHODS
 from thincam_jax.commands.study.build import assemble, check_optics
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files

@@ -1,13 +1,13 @@
 """Screen experiments: from the file to the study, its run with a calibration, and its page."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from thincam_jax import waveguide as wg
-from thincam_jax._core.memory import peak_memory
+from thincam_jax._core.memory import peak_memory, readable
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.report import Content, Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
@@ -32,6 +32,7 @@ from thincam_jax.studies.screen import (
 )
 from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun, CalibrationScores
 from thincam_jax.studies.screen_mask import ScreenMask
+from thincam_jax.waveguide.system import entries_of_a_ray
 
 
 def build_screen(config: ScreenConfig) -> ScreenStudy:
@@ -206,4 +207,22 @@ def _calibration(
         found.fit.table(),
         found.table(),
         Picture("distances.png", "A target at other distances", elsewhere),
+    )
+
+
+def rays(asked: Any, setup: Any) -> Iterator[str]:
+    """Rays of a see-through camera, and entries of its matrix."""
+    (rows, columns), parts = asked.sensor.shape, asked.band_samples or 1
+    if getattr(asked, "mask", None) is not None:
+        size = rows * columns * asked.object.cells[0] * asked.object.cells[1]
+        yield f"matrix of each model: {size / 1e6:.3g} million entries, {readable(4 * size)}"
+        return
+    cameras = build_cameras(asked) if setup is None else setup.cameras
+    plane = build_plane(asked) if setup is None else setup.plane
+    traced = rows * columns * asked.orders * parts * len(cameras)
+    entries = traced * entries_of_a_ray(cameras[0], plane)
+    yield (
+        f"matrix of each model: {rows}×{columns} pixels, {asked.orders} orders, {parts} parts of "
+        f"the band: {traced / 1e6:.3g} million rays, at most {entries / 1e6:.3g} million entries, "
+        f"{readable(12 * entries)}"  # a number and two indices, four bytes each
     )
