@@ -30,6 +30,7 @@ SOUND = [
     ("lensless/psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
     ("reconstruction/implicit_gradient.py", DOC + "import jaxopt"),
     ("plot/curves.py", DOC + "import matplotlib.figure"),
+    ("plot/high.py", DOC + "from ..studies.result import x"),
     ("design/landscape.py", DOC + "def plot():\n    from ..plot import curves"),
     ("design/curve.py", DOC + "if TYPE_CHECKING:\n    from matplotlib.axes import Axes"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),

@@ -41,7 +41,7 @@ MOST_ENTRIES = 14
 
 JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-PLOT = "plot"  # draws with matplotlib; what has a `plot` method imports it in that method
+PLOT = "plot"  # draws with matplotlib; a method that draws imports the file that draws it
 FRONT_END = "commands"
 ARRAY_LIBRARIES = ("jax", "jaxlib", "jaxtyping")
 
@@ -63,7 +63,7 @@ def crowded_roots(modules: list[Module]) -> list[str]:
 
 
 def imports_against_the_floors(modules: list[Module]) -> list[str]:
-    complaints = []
+    complaints, drawing = [], floors_of_figures(modules)
     for module in modules:
         for line, name in module.imports:
             parts = name.split(".")
@@ -87,12 +87,56 @@ def imports_against_the_floors(modules: list[Module]) -> list[str]:
             elif module.top == OUTSIDE and FLOOR[target] > FLOOR[OUTSIDE_USES]:
                 complaints.append(f"{where}: {OUTSIDE} imports {target}, above {OUTSIDE_USES}")
             elif module.top in FLOOR and FLOOR[target] >= FLOOR[module.top]:
-                if {module.top, target} != {"units", "_core"}:
-                    if target != PLOT or not waits(module, line):
-                        complaints.append(
-                            f"{where}: {module.top} imports {target}, which is no lower"
-                        )
+                height = drawing.get(".".join(parts[:3]), FLOOR[target])
+                figure = waits(module, line) and height <= FLOOR[module.top]
+                if {module.top, target} != {"units", "_core"} and not figure:
+                    complaints.append(f"{where}: {module.top} imports {target}, which is no lower")
     return complaints
+
+
+def floors_of_figures(modules: list[Module]) -> dict[str, int]:
+    """Floor of each file of `plot`: that of the highest room that it imports when it runs.
+
+    So what it draws may stand below the room, and import the file where it is asked for a figure.
+    """
+    files = {f"{PACKAGE}.{PLOT}.{Path(m.path).stem}": m for m in modules if m.top == PLOT}
+
+    def height(name: str, above: tuple[str, ...] = ()) -> int:
+        imported = [one.split(".") for _, one in files[name].imports_at_run_time]
+        rooms = [FLOOR.get(parts[1], 0) for parts in imported if parts[0] == PACKAGE and parts[1:]]
+        figures = {".".join(parts[:3]) for parts in imported} & files.keys() - {*above, name}
+        rooms = [room for room in rooms if room != FLOOR[PLOT]]
+        return max([0, *rooms, *(height(one, (*above, name)) for one in figures)])
+
+    return {name: height(name) for name in files}
+
+
+def circles_through_figures(modules: list[Module]) -> list[str]:
+    """A file of `plot` does not import, by others or lazily, what imports it to be drawn."""
+    files = {
+        f"{PACKAGE}.{Path(m.path).with_suffix('').as_posix()}".replace("/", "."): m for m in modules
+    }
+    uses = {
+        name: {
+            found
+            for _, one in module.imports_at_run_time
+            if (found := one if one in files else one.rpartition(".")[0]) in files
+        }
+        for name, module in files.items()
+    }
+
+    def reaches(start: str) -> set[str]:
+        found, new = set(), {start}
+        while new:
+            new = {other for one in new for other in uses[one]} - found
+            found |= new
+        return found
+
+    return [
+        f"{module.path}: draws what it imports itself: import that for annotations only"
+        for name, module in files.items()
+        if module.top == PLOT and name in reaches(name)
+    ]
 
 
 def may_use_the_rig(module: Module, line: int) -> bool:
@@ -156,6 +200,7 @@ RULES = (
     unknown_rooms,
     crowded_roots,
     imports_against_the_floors,
+    circles_through_figures,
     modules_hidden_by_names,
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
@@ -234,7 +279,14 @@ BROKEN = [
     (UP, "commands/cli.py", "def f():\n    from ..hardware import x", "only its command may"),
     (UP, "__init__.py", "from . import hardware", "only its command may"),
     (UP, "design/space.py", "from ..plot import curves", "which is no lower"),
+    (UP, "design/space.py", "def f():\n    from ..plot import curves, high", "which is no lower"),
     (UP, "plot/curves.py", "from ..commands import page", "which is no lower"),
+    (
+        circles_through_figures,
+        "plot/curves.py",
+        "def f():\n    from ..design.landscape import x",
+        "plot/curves.py: draws what",
+    ),
     (UP, "__init__.pyi", "from .hardware.stage import Stage as Stage", "only its command may"),
     (modules_hidden_by_names, "lensless/__init__.py", "from .psf import psf", "psf hides the"),
     (modules_hidden_by_names, "lensless/__init__.py", "from ..units import masks", "masks hides"),

@@ -1,19 +1,24 @@
 """The pictures of a training."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.learn.refocusing.network import RefocusNetwork
-from thincam_jax.learn.refocusing.scenes import Batch
-from thincam_jax.learn.refocusing.use import SURE, Reading
-from thincam_jax.learn.training import TrainingState
+from thincam_jax.learn.refocusing.use import SURE
 from thincam_jax.plot.frame import drawing, grey_levels, white_level
+
+if TYPE_CHECKING:
+    from thincam_jax.learn.refocusing.network import RefocusNetwork
+    from thincam_jax.learn.refocusing.scenes import Batch
+    from thincam_jax.learn.refocusing.use import Reading
+    from thincam_jax.learn.training import TrainingState
 
 _SMOOTHED = 25  # steps
 _SHOWN = 3  # scenes
 
 
-def draw_losses(state: TrainingState, check_every: int) -> Figure:
+def draw_losses(state: "TrainingState", check_every: int) -> Figure:
     """The loss of every step and of every check."""
     figure, ax = drawing((7, 3.6))
     losses = state.losses[: state.step]
@@ -29,7 +34,7 @@ def draw_losses(state: TrainingState, check_every: int) -> Figure:
     return figure
 
 
-def draw_scenes(network: RefocusNetwork, batch: Batch, reading: Reading) -> Figure:
+def draw_scenes(network: "RefocusNetwork", batch: "Batch", reading: "Reading") -> Figure:
     """Scenes: capture, what a lens would see and what the network makes of it; distances."""
     rows = min(_SHOWN, len(batch.capture))
     figure, axes = drawing((2.1 * 7, 2.35 * rows), rows, 7, squeeze=False)

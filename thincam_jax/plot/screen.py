@@ -1,6 +1,7 @@
 """Figures of a see-through screen: its rays, and what its models reconstruct."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +11,16 @@ from matplotlib.figure import Figure
 
 from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.plot.frame import drawing, line_style
-from thincam_jax.studies.pictures import Reconstructed
-from thincam_jax.studies.rig import ShownPictures
-from thincam_jax.studies.screen import ScreenResult, ScreenStudy
-from thincam_jax.studies.screen_calibration import CalibrationResult, diagonal_cells
+from thincam_jax.studies.pictures import diagonal_cells
 from thincam_jax.studies.screen_mask import MaskSystem
 from thincam_jax.units import nm
-from thincam_jax.waveguide.rays import Rays
+
+if TYPE_CHECKING:
+    from thincam_jax.studies.pictures import Reconstructed
+    from thincam_jax.studies.rig import ShownPictures
+    from thincam_jax.studies.screen import ScreenResult, ScreenStudy
+    from thincam_jax.studies.screen_calibration import CalibrationResult
+    from thincam_jax.waveguide.rays import Rays
 
 _RAYS = (
     "Side view: rays of three pixels through {}, plate (grey) and out to the object; thin lines "
@@ -68,7 +72,7 @@ def in_colour(capture: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     return encode_srgb(linear)[::-1, ::-1]
 
 
-def draw_result(result: ScreenResult, rays: Rays) -> dict[str, Figure]:
+def draw_result(result: "ScreenResult", rays: "Rays") -> dict[str, Figure]:
     """All figures of a study, by the name of their file."""
     study, system = result.study, result.study.systems[0]
     if isinstance(system, MaskSystem):
@@ -87,7 +91,7 @@ def draw_result(result: ScreenResult, rays: Rays) -> dict[str, Figure]:
     }
 
 
-def captions(study: ScreenStudy) -> dict[str, str]:
+def captions(study: "ScreenStudy") -> dict[str, str]:
     """Captions of the figures of a study, by their names."""
     lens = study.mask is None
     turned = "in the colours of its pixels, turned upright" if lens else "turned upright"
@@ -99,7 +103,7 @@ def captions(study: ScreenStudy) -> dict[str, str]:
     }
 
 
-def draw_rays(study: ScreenStudy) -> Figure:
+def draw_rays(study: "ScreenStudy") -> Figure:
     """Side view: rays of three pixels from the sensor through the plate to its front."""
     camera, screen = study.camera, study.camera.screen
     half = 0.43 * camera.sensor.shape[0] * float(camera.sensor.pitch)
@@ -140,7 +144,7 @@ def draw_rays(study: ScreenStudy) -> Figure:
     return figure
 
 
-def draw_field(study: ScreenStudy, rays: Rays) -> Figure:
+def draw_field(study: "ScreenStudy", rays: "Rays") -> Figure:
     """Colour and ghost shift of every pixel, in grey with contours, and the colours as seen."""
     rows, columns = study.camera.sensor.shape
     pitch = float(study.camera.sensor.pitch)
@@ -166,7 +170,7 @@ def draw_field(study: ScreenStudy, rays: Rays) -> Figure:
     return figure
 
 
-def draw_images(result: ScreenResult, figure: Figure | None = None) -> Figure:
+def draw_images(result: "ScreenResult", figure: Figure | None = None) -> Figure:
     """Targets, captures, and what the first model reconstructs by every solver."""
     study, (first, *_) = result.study, result.models.items()
     captures = np.asarray(study.captures.images)
@@ -179,7 +183,7 @@ def draw_images(result: ScreenResult, figure: Figure | None = None) -> Figure:
     return _sheet(study.targets, columns, figure)
 
 
-def draw_models(result: ScreenResult) -> Figure:
+def draw_models(result: "ScreenResult") -> Figure:
     """Targets, and what every model reconstructs by the last solver."""
     last = list(result.study.solvers)[-1]
     found = {name: model.methods[last] for name, model in result.models.items()}
@@ -187,7 +191,7 @@ def draw_models(result: ScreenResult) -> Figure:
     return _sheet(result.study.targets, columns)
 
 
-def draw_pictures(found: ShownPictures) -> Figure:
+def draw_pictures(found: "ShownPictures") -> Figure:
     """Pictures shown, their captures in grey, turned upright, and reconstructions by solver.
 
     What is not known stays white.
@@ -199,7 +203,7 @@ def draw_pictures(found: ShownPictures) -> Figure:
     return _sheet(shown, columns)
 
 
-def _labels(found: Reconstructed) -> list[str]:
+def _labels(found: "Reconstructed") -> list[str]:
     scores = [_decibels(score.psnr_db) for score in found.scores.targets.values()]
     return scores or [""] * len(found.images)
 
@@ -231,7 +235,7 @@ def _panel(ax: Axes, image: np.ndarray, label: str, title: str) -> None:
     ax.set_title(title, fontsize=9)
 
 
-def draw_errors(result: ScreenResult) -> Figure:
+def draw_errors(result: "ScreenResult") -> Figure:
     """PSNR of every target by the last solver with each model."""
     figure, ax = drawing((9, 3.8))
     last = list(result.study.solvers)[-1]
@@ -245,7 +249,7 @@ def draw_errors(result: ScreenResult) -> Figure:
     return figure
 
 
-def draw_calibration(result: CalibrationResult) -> dict[str, Figure]:
+def draw_calibration(result: "CalibrationResult") -> dict[str, Figure]:
     """Figures of a calibration, by the name of their file."""
     pitch = float(result.study.camera.sensor.pitch)
     figures = {"columns": draw_columns(pitch, result.cells, result.columns)}
@@ -278,7 +282,7 @@ def draw_columns(
     return figure
 
 
-def draw_distances(result: CalibrationResult) -> Figure:
+def draw_distances(result: "CalibrationResult") -> Figure:
     """The first target in halftones at other distances, by each matrix, in grey with its PSNR."""
     targets, images = result.study.targets, result.images
     halftones = (n for n, truth in enumerate(targets.values()) if len(np.unique(truth)) > 2)

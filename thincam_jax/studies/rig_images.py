@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax.imaging.display import as_picture
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured.bayer import Pattern, colour_sites, demosaic, demosaic_mask
 from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
@@ -15,7 +16,7 @@ from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.wiener import Wiener
-from thincam_jax.studies.evaluate import as_picture, cameras_of, coupled
+from thincam_jax.studies.evaluate import cameras_of, coupled
 from thincam_jax.studies.study import Method, Study
 
 FrameSolver = Callable[[Float[np.ndarray, "capture y x"]], Reconstruction]

@@ -37,13 +37,13 @@ from thincam_jax.studies.evaluate import rounded
 from thincam_jax.studies.pictures import (
     Reconstructed,
     ScreenCaptures,
+    diagonal_cells,
     reconstruct_targets,
     reconstructed,
 )
 from thincam_jax.studies.screen import GLASS, ScreenStudy, with_glass
 
 MEASURED = "measured matrix"
-_SHOWN = 3  # cells whose columns of the matrix are compared with the exact ones
 
 
 @dataclass(frozen=True)
@@ -402,12 +402,6 @@ class CalibrationRun:
                 rounded(float(np.mean(scores))),
                 dict(zip(study.targets, map(rounded, scores), strict=True)),
             )
-
-
-def diagonal_cells(shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """Cells (row, column) spread along a diagonal of the object."""
-    rows, columns = ((2 * np.arange(_SHOWN) + 1) * n // (2 * _SHOWN) for n in shape)
-    return [(int(row), int(column)) for row, column in zip(rows, columns, strict=True)]
 
 
 def _columns(

@@ -16,13 +16,13 @@ from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.run import build_cameras, build_plane, published_figures
 from thincam_jax.commands.sections import PHASES, PictureConfig, SensorConfig, build_solver
 from thincam_jax.commands.study.build import build_optics, picture
+from thincam_jax.imaging.display import as_picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.measured import write_image
 from thincam_jax.measured.calibration.alignment import Alignment
 from thincam_jax.plot import rig as plot
 from thincam_jax.plot.screen import draw_columns, draw_pictures
-from thincam_jax.studies.evaluate import as_picture
 from thincam_jax.studies.pictures import PUBLISHED, beside, finding
 from thincam_jax.studies.rig import (
     FrameAgreement,
