@@ -31,7 +31,6 @@ from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.training_search import TrainingError, TrainingSettings
 from thincam_jax.imaging.targets import sample_image
-from thincam_jax.learn import Denoiser
 from thincam_jax.studies.design import DesignStudy, FrontPlan, TrainingPlan, as_method
 from thincam_jax.studies.study import Method, Study, Target, synthesis_matrix
 
@@ -160,8 +159,14 @@ def _training(config: DesignConfig) -> TrainingPlan | None:
         TrainingError(asked.reconstruction),
         TrainingSettings(asked.samples, asked.starts, asked.steps, config.search.grid),
         asked.pixels,
-        Denoiser() if asked.reconstruction == "pnp" else None,
+        _denoiser() if asked.reconstruction == "pnp" else None,
     )
+
+
+def _denoiser() -> Any:
+    from thincam_jax.learn import Denoiser
+
+    return Denoiser()
 
 
 def _fronts(config: DesignConfig, problem: DesignProblem) -> FrontPlan | None:

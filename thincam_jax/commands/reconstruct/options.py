@@ -326,7 +326,7 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
     """
     if read_kind(config) is KINDS["learned"]:
         # Here: other captures need not wait for the learned parts.
-        from thincam_jax.commands.learned.refocusing import build_camera
+        from thincam_jax.learn.commands.refocusing import build_camera
 
         whole = build_camera(load_experiment(config, tuple(overrides), "train"))
         if distance is None:
