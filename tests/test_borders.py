@@ -23,6 +23,19 @@ TESTS = {
     "waveguide": ("waveguide/studies/test_screen.py", "waveguide/test_rays.py"),
     "learn": ("learn/test_residual_noise.py", "learn/commands/test_train_denoiser.py"),
 }
+PNP = ("methods.0.kind=pnp", "methods.0.synthesis=separate")
+# Commands of others that need a room, and what they say.
+NEEDING = {
+    "hardware": (("run", "out"), "this needs thincam_jax.hardware"),
+    "waveguide": (
+        ("explain", "configs/rig_hadamard.yaml"),
+        "configs/rig_hadamard.yaml:38: virtual.screen: needs thincam_jax.waveguide",
+    ),
+    "learn": (
+        ("run", "configs/quick.yaml", "--dry-run", "--set", PNP[0], "--set", PNP[1]),
+        "this needs thincam_jax.learn",
+    ),
+}
 IMPORTS = """
 import importlib, pkgutil, sys
 import thincam_jax as tc
@@ -70,6 +83,12 @@ def test_the_rest_works_without(room, tmp_path):
         told = f"thincam: {file}: kind: {name} needs thincam_jax.{room}, which this installation"
         done = run("-c", COMMAND, "explain", str(file))
         assert (done.returncode, done.stderr) == (2, f"{told} has not\n")
+    words, told = NEEDING[room]
+    done = run("-c", COMMAND, *words)
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"thincam: {told}, which this installation has not\n",
+    )
     left = [test for other in CLOSED if other != room for test in TESTS[other]]
     tests = [f"tests/{test}" for test in (*CORE, *left)]
     done = run("-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests)
