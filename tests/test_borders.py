@@ -54,9 +54,9 @@ def test_the_registry_knows_the_closed_rooms():
 @pytest.mark.thorough
 @pytest.mark.parametrize("room", CLOSED)
 def test_the_rest_works_without(room, tmp_path):
-    parts = {"ignore": shutil.ignore_patterns("__pycache__", ".*")}
+    ignore = shutil.ignore_patterns("__pycache__", ".*")
     for folder in (PACKAGE, "tests", "configs"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, **parts)
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=ignore)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for folder in (PACKAGE, "tests"):
         shutil.rmtree(tmp_path / folder / room)
@@ -66,9 +66,9 @@ def test_the_rest_works_without(room, tmp_path):
             path.unlink()
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
-        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "MPLBACKEND": "Agg"}
-        how = {"capture_output": True, "text": True, "cwd": tmp_path, "env": environment}
-        return subprocess.run([sys.executable, "-W", "ignore", *words], check=False, **how)
+        own = {**os.environ, "PYTHONPATH": str(tmp_path), "MPLBACKEND": "Agg"}
+        call = [sys.executable, "-W", "ignore", *words]
+        return subprocess.run(call, capture_output=True, text=True, cwd=tmp_path, env=own)
 
     done = run("-c", IMPORTS)
     assert done.returncode == 0, done.stderr
