@@ -12,11 +12,11 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
-from commands.capture import tiny as capture
 from commands.design import tiny as design
-from commands.learned.test_train_denoiser import FILE as TRAINING
 from commands.reconstruct import simulated
 from commands.sweep import mini
+from hardware.commands import tiny as capture
+from learn.commands.test_train_denoiser import FILE as TRAINING
 
 from helpers import ROOT
 from thincam_jax.commands.interrupt import INTERRUPTED

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import skimage.io
-from commands.learned.test_train import FILE
 from commands.reconstruct import simulated
 from commands.reconstruct.test_command import one_line
 from learn import tiny_network as tiny
+from learn.commands.test_train import FILE
 from typer.testing import CliRunner
 
 from thincam_jax.commands import cli
