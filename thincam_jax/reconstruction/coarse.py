@@ -10,6 +10,8 @@ up to the variation of A U f within blocks, where w_c is the sum of the weights 
 a convolution with every second sample of the PSF, filtered with (1, 2, 1)/2 along both axes.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -52,6 +54,7 @@ def coarsened(
     return problem, image, size
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def finer(image: Image, shape: tuple[int, int]) -> Float[Array, "..."]:
     """An image of `coarser` on the pixels of the field, interpolated linearly."""
     whole = (*image.shape[:-2], *(_SIZE * n for n in image.shape[-2:]))

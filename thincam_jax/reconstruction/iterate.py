@@ -201,7 +201,7 @@ def iterate(
     began = time.perf_counter()
 
     def judged(image) -> float:
-        return float(jnp.sum((objective or method.objective)(image)))
+        return float(np.sum(np.asarray((objective or method.objective)(image))))
 
     best, history = image, [Progress(done, judged(image), math.nan, math.nan)]
     status: Status = "iterations_exhausted"

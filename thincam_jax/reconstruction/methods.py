@@ -356,7 +356,7 @@ class AdmmTV(AbstractRegularised):
 
     def _from_nothing(self, problem, image, callback) -> Outcome:
         """Outcome from a uniform or black image; a biased camera's begins without uniform light."""
-        lit = bool(jnp.any(image != 0))
+        lit = bool(np.any(np.asarray(image)))
         first = self._without_uniform_light(problem, image, callback) if lit else None
         if first is None:
             return self._by_admm(problem, image, callback)

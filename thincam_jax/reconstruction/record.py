@@ -76,5 +76,5 @@ def record(
     if not checks.holds_traced(scene, cameras):
         covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]
         widest = np.minimum(np.max(covers, axis=0), optics.seen_field)
-        optics = optics.replace(field_shape=tuple(int(n) for n in widest))
+        optics = optics.replace(field_shape=tuple(int(n) for n in widest), whole_scene=True)
     return Recording(captures, optics, noise_variance=variances)
