@@ -26,6 +26,8 @@ The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes 
 which `thincam --help` need not wait for.
 """
 
+import sys
+
 import lazy_loader
 
 from thincam_jax._core.names import modules_of
@@ -40,4 +42,8 @@ def __getattr__(name: str):
         from importlib.metadata import version
 
         return version("thincam_jax")
+    if "jax" not in sys.modules:
+        from thincam_jax._core.program_cache import keep_programs
+
+        keep_programs()
     return _attribute(name)

@@ -26,7 +26,12 @@ import optimistix
 from jaxtyping import Array, Float, PyTree
 
 from thincam_jax._core.checks import Number
-from thincam_jax.reconstruction.iterate import AbstractMethod, OptimistixMethod, Residuals, SolverState
+from thincam_jax.reconstruction.iterate import (
+    AbstractMethod,
+    OptimistixMethod,
+    Residuals,
+    SolverState,
+)
 from thincam_jax.reconstruction.problem import InverseProblem, compiled_objective
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
