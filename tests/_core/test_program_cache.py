@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from commands.test_cli import call
 
-from helpers import ROOT
 import thincam_jax as tc
+from helpers import ROOT
 from thincam_jax._core import program_cache as cache
 from thincam_jax.commands import cli
 

@@ -13,8 +13,8 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from thincam_jax.commands import terminal
 from thincam_jax._core.program_cache import cache_state, keep_programs
+from thincam_jax.commands import terminal
 from thincam_jax.commands.capture.command import capture, known_drivers, preview
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
