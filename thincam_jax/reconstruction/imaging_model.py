@@ -238,7 +238,8 @@ class Cameras(Module):
         for number, ratio in zip(range(self.count), ratios, strict=True):
             own = own_field(field, ratio)
             planes = [self.own_psf(number, own, distance) for distance in distances]
-            kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
+            own_scale = [k if ratio == 1 else register(k, ratio) / ratio**2 for k in planes]
+            kernels.append(_together(own_scale))
         return kernels
 
     def own_psf(self, number: int, field: tuple[int, int], distance: Number) -> Float[Array, "k l"]:
@@ -349,6 +350,11 @@ def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*
         antialias=False,
     )
     return enlarged
+
+
+@jax.jit
+def _together(planes: list[Float[Array, "k l"]]) -> Float[Array, "1 plane k l"]:
+    return jnp.stack(planes)[None]
 
 
 def _coarser(count: int, few: int, ratio: float) -> Float[Array, "few count"]:
