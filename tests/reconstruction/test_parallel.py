@@ -2,6 +2,7 @@
 
 import threading
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,6 +116,17 @@ def test_units_and_penalties_do_not_depend_on_the_batch():
         )
     )
     np.testing.assert_allclose(both.image[0], alone.image, rtol=1e-10, atol=1e-12)
+
+
+def test_each_part_takes_the_penalties_of_its_part_of_another_method():
+    method = ParallelMethod(scenes.problem(batch=(2,))[0], admm)
+
+    def penalties(method):
+        return [jax.tree.leaves(one.arguments.penalties) for one in method.methods]
+
+    wanted = [[(2.0 + part) * one for one in own] for part, own in enumerate(penalties(method))]
+    found = penalties(method.like(eqx.tree_at(penalties, method, wanted)))
+    np.testing.assert_array_equal(found, wanted)
 
 
 def test_only_independent_parts_run_in_parallel():

@@ -124,16 +124,16 @@ def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recordi
 
 
 def pinned(recording: Recording) -> Recording:
-    """A recording that keeps the sensor's field; a field that is given stays."""
+    """A recording that keeps the sensor's field, whatever is beyond; a given one stays."""
     model = recording.imaging_model
     if not isinstance(model, Cameras) or model.pixels is not None:
         return recording
-    return with_field(recording, model.cameras[0].sensor.shape)
+    return with_field(recording, model.cameras[0].sensor.shape, whole=True)
 
 
-def with_field(recording: Recording, shape: tuple[int, int]) -> Recording:
+def with_field(recording: Recording, shape: tuple[int, int], *, whole: bool = False) -> Recording:
     """A recording of `Cameras` with another field."""
-    sides = {"field_shape": shape, "field_height": None, "field_width": None, "whole_scene": False}
+    sides = {"field_shape": shape, "field_height": None, "field_width": None, "whole_scene": whole}
     model = dataclasses.replace(recording.imaging_model, **sides)
     return dataclasses.replace(recording, imaging_model=model)
 
