@@ -239,7 +239,7 @@ class Cameras(Module):
             own = own_field(field, ratio)
             planes = [self.own_psf(number, own, distance) for distance in distances]
             own_scale = [k if ratio == 1 else register(k, ratio) / ratio**2 for k in planes]
-            kernels.append(_together(own_scale))
+            kernels.append(jnp.stack(own_scale)[None])
         return kernels
 
     def own_psf(self, number: int, field: tuple[int, int], distance: Number) -> Float[Array, "k l"]:
@@ -350,11 +350,6 @@ def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*
         antialias=False,
     )
     return enlarged
-
-
-@jax.jit
-def _together(planes: list[Float[Array, "k l"]]) -> Float[Array, "1 plane k l"]:
-    return jnp.stack(planes)[None]
 
 
 def _coarser(count: int, few: int, ratio: float) -> Float[Array, "few count"]:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from thincam_jax.reconstruction.regularisers import Image
 
@@ -253,7 +253,7 @@ def _start(method: OptimistixMethod, image) -> SolverState:
     return SolverState(value, inside)
 
 
-def _steps(method: OptimistixMethod, state: SolverState, count: Int[Array, ""]) -> SolverState:
+def _steps(method: OptimistixMethod, state: SolverState, count: Any) -> SolverState:
     """`count` steps: a loop of any length, and the last one, which alone is judged.
 
     What a solver computes for its residuals only, the compiler drops from the loop.
