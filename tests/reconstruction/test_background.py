@@ -15,7 +15,14 @@ from thincam_jax.imaging.operators import Matrix
 from thincam_jax.reconstruction import solve_fixed_point
 from thincam_jax.reconstruction.implicit_gradient import NeumannSeries
 from thincam_jax.reconstruction.normal_equations import normal_equations
-from thincam_jax.reconstruction.problem import InverseProblem, gradient, objective, total_misfit
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    gradient,
+    objective,
+    scene_level,
+    total_misfit,
+    uniform_level,
+)
 from thincam_jax.reconstruction.ridge import solve_ridge
 
 RNG = np.random.default_rng(65)
@@ -196,6 +203,26 @@ def test_the_slope_in_tau_with_a_background_to_find(share):
     expected = float(finite_difference(jax.jit(error), jnp.asarray(2.0), jnp.asarray(1.0), 1e-2))
     assert slope == pytest.approx(expected, rel=2e-3)
     assert float(found(2.0).min()) == 0
+
+
+def test_a_background_above_zero_makes_no_scene_brighter():
+    """A dark room: without a bound its level is that of an image of full contrast, 3 times as high.
+
+    `Ridge` takes its prior from it: behind a quarter of a sensor that was 0.6 dB less.
+    """
+    psf = np.random.default_rng(1).random((1, 7, 6)) ** 6
+    blank = tc.Recording(np.zeros((1, 36, 44)), tc.Psfs(psf), noise_variance=1e-4)
+    operator = blank.problem().operators[0]
+    seen = operator(jnp.zeros(operator.in_shape).at[..., 9:20, 12:30].set(1.0))[None, 0]
+    level = {}
+    for offset in (0.0, 0.5 * float(seen.mean())):
+        found, known = (
+            tc.Recording(seen + offset, tc.Psfs(psf), noise_variance=1e-4, background=b).problem()
+            for b in (None, 0.0)
+        )
+        level[offset] = [float(f(found)[0]) for f in (uniform_level, scene_level)]
+        assert level[offset][1] == min(level[offset][0], float(scene_level(known)[0]))
+    assert level[0.0][0] > 1.5 * level[0.0][1]
 
 
 def test_the_same_background_is_sought_under_jit():

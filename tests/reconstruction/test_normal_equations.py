@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.reconstruction.normal_equations import mean_powers
+from thincam_jax.reconstruction.normal_equations import mean_powers, normal_equations
+from thincam_jax.reconstruction.problem import InverseProblem
 
+RNG = np.random.default_rng(2)
 FIELD = (10, 15)  # lengths that transform fast, so that nothing is padded
 
 
@@ -47,3 +49,16 @@ def test_it_keeps_the_trace_where_the_sensor_cuts(sensor):
     # Lags are weighted by the geometric mean of what both points show.
     assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.9
     assert found.min() > 0
+
+
+def test_a_background_takes_the_uniform_light_of_the_sensor():
+    """The nearest circulant of AᵀA − Aᵀ1 1ᵀA/N, of which a hundredth of AᵀA's is kept."""
+    operator = CropConvolution(jnp.asarray(RNG.random((4, 3))), 1.0, (13, 19), FIELD)
+    captures = [jnp.zeros((1, 13, 19))]
+    problem = InverseProblem(operator, captures, background="unknown")
+    whole, light = gram(operator), np.asarray(operator.adjoint(jnp.ones((13, 19)))).ravel()
+    left = nearest_circulant(whole - np.outer(light, light) / (13 * 19))
+    normal = normal_equations(problem, jnp.asarray(0.3))
+    expected = np.maximum(left, 0.01 * nearest_circulant(whole))
+    assert (expected[0, 0] < 0.6 * nearest_circulant(whole)[0, 0]) and normal.powers is not None
+    np.testing.assert_allclose(normal.powers[0, 0, 0].real, expected, rtol=1e-9)

@@ -26,7 +26,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
-from thincam_jax._core.precision import as_complex, product
+from thincam_jax._core.precision import as_complex, product, squared_modulus
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -40,6 +40,7 @@ from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.imaging.operators.separable import SeparableModes
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
+    back_project,
     back_projected,
     convolutions,
     detector_shape,
@@ -55,6 +56,8 @@ INNER_STEPS = 500
 _SPAN, _FEW = 8, 1024
 # In units of the machine's, of the eigenvalues of convolutions, relative to the largest.
 _ROUNDING = 10
+# Least part of a convolution's power that is left where a background takes the uniform light.
+_KEPT = 0.01
 
 
 class AbstractNormal(eqx.Module):
@@ -119,7 +122,10 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
     convolved = convolutions(fixed)
-    powers = None if convolved is None else mean_powers(convolved, fixed.weights)
+    powers = None
+    if convolved is not None:
+        powers = mean_powers(convolved, fixed.weights)
+        powers = _less_uniform(fixed, powers) if fixed.has_background else powers
     return IterativeNormal(problem, shift, powers=powers)
 
 
@@ -346,6 +352,25 @@ def mean_powers(
     least = _ROUNDING * jnp.finfo(folded.dtype).eps * jnp.max(jnp.abs(powers))
     unit = jnp.eye(powers.shape[1], dtype=folded.dtype)[..., None, None]
     return powers + as_complex(least * unit)
+
+
+@jax.jit
+def _less_uniform(problem: InverseProblem, powers: Complex[Array, "channel p q v u"]):
+    r"""Eigenvalues without the part of uniform light on the sensor, which is the background's.
+
+    :math:`A^Tw 1 1^TwA / 1^Tw1` of n pixels has the nearest circulant eigenvalues
+    :math:`|F A^T w 1|^2 / (n\, 1^T w 1)`. Of one plane; several keep theirs.
+    """
+    if powers.shape[1] > 1:
+        return powers
+    lost, window = 0.0, padded_field(problem.field_shape)
+    for operator, weight in _weighted(problem):
+        pixels = jnp.mean(weight, axis=tuple(range(weight.ndim - 2)))
+        pixels = jnp.broadcast_to(pixels, operator.out_shape)
+        light = jnp.fft.rfft2(back_project(operator, pixels), s=window)[..., None, :, :]
+        total = jnp.sum(pixels[0]) * math.prod(problem.field_shape)
+        lost = lost + squared_modulus(light) / or_one(total)
+    return jnp.maximum(powers.real - lost, _KEPT * powers.real).astype(powers.dtype)
 
 
 def _folded(lags: Float[Array, "*planes n"], side: int, period: int) -> Float[Array, "*planes m"]:

@@ -284,20 +284,25 @@ def with_tau(problem: InverseProblem, tau: Number) -> InverseProblem:
 _UNEVEN = 1e-3
 
 
-def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
+def uniform_level(
+    problem: InverseProblem, *, has_background: bool | None = None
+) -> Float[Array, "*batch channel"]:
     r"""The brightness of a uniform image that explains each channel best, by least squares.
+
+    - `has_background`: whether to leave room for a background; default: as the problem does.
 
     Where a background would explain it as well, the brightness is that of an image of full
     contrast: between :math:`\sigma_g/\sum h`, where its detail is coarser than the PSF h, and
     :math:`\sigma_g/(\sum h^2)^{1/2}`, where its pixels vary independently, the geometric mean.
     """
     seen, light = 0.0, 0.0
+    has_background = problem.has_background if has_background is None else has_background
     for operator, capture, weight in zip(
         problem.operators, problem.captures, problem.weights, strict=True
     ):
         axes = tuple(range(-len(detector_shape(operator)), 0))
         flat = forward(operator, jnp.ones((1,) * 4, capture.dtype))
-        if problem.has_background:
+        if has_background:
             whole, uneven = flat, flat - weighted_mean(weight, flat, len(axes))
             even = weighted_mean(weight, flat**2, len(axes))
             shown = weighted_mean(weight, uneven**2, len(axes)) > _UNEVEN * even
@@ -317,13 +322,21 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
     return jnp.where(light > 0, seen / jnp.where(light > 0, light, 1), 0)
 
 
-compiled_level = jax.jit(uniform_level)
+def scene_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
+    """The uniform brightness of the scene: a background that is not negative takes none away."""
+    level = uniform_level(problem)
+    if problem.background != "nonnegative":
+        return level
+    return jnp.minimum(level, uniform_level(problem, has_background=False))
+
+
+compiled_level = jax.jit(scene_level)
 
 
 @jax.jit
 def uniform_image(problem: InverseProblem) -> Image:
     """The non-negative uniform image that explains the captures best, a good start image."""
-    level = jnp.maximum(uniform_level(problem), 0)[..., None, None, None]
+    level = jnp.maximum(scene_level(problem), 0)[..., None, None, None]
     return jnp.broadcast_to(level, problem.image_shape)
 
 

@@ -7,7 +7,7 @@ r"""Ridge (Tikhonov) regression: the posterior mean under a white prior.
 It is linear in the captures and models the crop of the sensor and the weight of every pixel, which
 a Wiener filter does not. With weights 1/σ² and a white Gaussian prior of mean f̄ and variance s²,
 f is the posterior mean if ρ = 1/s². s is unknown and taken as the brightness of the uniform image
-that explains the captures best (`uniform_level`), as in a scene of full contrast:
+that explains the captures best (`scene_level`), as in a scene of full contrast:
 
 .. math:: \rho = \rho_{rel} / s^2,\qquad s^2 = \mathrm{mean}\,\mathrm{level}^2
 
@@ -61,8 +61,8 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     or_one,
     residuals,
+    scene_level,
     start_image,
-    uniform_level,
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
@@ -211,7 +211,7 @@ class Ridge(AbstractSolver):
 @jax.jit
 def _uniform(problem: InverseProblem):
     """Level of the uniform image, and that image, not negative."""
-    level = uniform_level(problem)
+    level = scene_level(problem)
     level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
     return level, jnp.maximum(level, 0)[..., None, None, None]
 
