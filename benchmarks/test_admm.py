@@ -199,7 +199,9 @@ def test_admm(benchmark, capsys, case):
 def memory_line(method):
     """What the compiled chunk allocates, against the arrays it must hold."""
     state = method.start(zeros(method.problem))
-    memory = _advance_donated.lower(method, state, CHUNK).compile().compiled.memory_analysis()
+    memory = (
+        _advance_donated.lower(method, state, np.int32(CHUNK)).compile().compiled.memory_analysis()
+    )
     held = sum(x.nbytes for x in jax.tree.leaves((state, method.arguments)))
     peak = (
         memory.argument_size_in_bytes

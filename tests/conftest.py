@@ -3,7 +3,6 @@
 import atexit
 import gc
 import os
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
@@ -56,8 +55,6 @@ jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
 
 def pytest_collection_finish():
     """Settings of what tests import: not of the process that only gives them to the workers."""
-    # The small images of tests take longer to compile for than to reconstruct.
-    import_module("thincam_jax.reconstruction.iterate").UNROLLED = 2
     # Tracing makes many short-lived objects: by default a tenth of the time is garbage collection.
     # What was imported stays, and need not be looked at again.
     gc.collect()

@@ -26,6 +26,8 @@ The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes 
 which `thincam --help` need not wait for.
 """
 
+import sys
+
 from thincam_jax._core.names import lazy_face
 
 # Without `__all__`, for which `help` would print every class in full.
@@ -37,4 +39,8 @@ def __getattr__(name: str):
         from importlib.metadata import version
 
         return version("thincam_jax")
+    if "jax" not in sys.modules:
+        from thincam_jax._core.program_cache import keep_programs
+
+        keep_programs()
     return _attribute(name)

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from helpers import ROOT, full_disk
 from thincam_jax._core import environment as installation
+from thincam_jax._core.program_cache import cache_state
 from thincam_jax.commands import cli
-from thincam_jax.commands.cache import cache_state
 from thincam_jax.commands.kinds import examples
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies

@@ -9,7 +9,7 @@ import pytest
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2, value_and_slope
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
-from thincam_jax.lensless.forward import imaging_operator, projected_shape
+from thincam_jax.lensless.forward import imaging_operator, in_steps, projected_shape
 from thincam_jax.units import nm, um
 
 # 1.6 mm × 1.92 mm of sensor; β·(width/2)² = 36 rad, zones at the edge of 9.5 cycles/mm (Nyquist 25)
@@ -117,6 +117,8 @@ def test_a_nearer_plane_is_larger_on_the_sensor():
     assert projected_shape(camera(), plane(image, 100.0)) == (30, 40)
     assert projected_shape(camera(), plane(image, 50.0)) == (60, 80)
     assert projected_shape(camera(), plane(image, 106.0)) == (30, 38)  # 28.3 and 37.7, made even
+    shapes = [(24, 30), (25, 33), (419, 444), (700, 1300)]
+    assert [in_steps(s) for s in shapes] == [(24, 30), (25, 33), (449, 448), (704, 1408)]
 
 
 def test_batches_go_image_by_image():

@@ -6,6 +6,8 @@ import pytest
 import skimage.data
 
 import thincam_jax as tc
+from thincam_jax.lensless.forward import project
+from thincam_jax.lensless.psf import _psf
 from thincam_jax.units import deg, nm, um
 
 SENSOR = tc.Sensor((40, 52), 60 * um)
@@ -42,6 +44,16 @@ def test_several_cameras_have_noise_of_their_own():
     assert not np.allclose(first, second) and recording.imaging_model.field_shape == (32, 32)
     assert recording.noise_variance[0] != recording.noise_variance[2]
     assert tc.record(ZONES[0], scene()).noise_variance is None
+
+
+def test_distances_near_each_other_share_field_and_programs():
+    tc.record(CAMERA, scene(width=140.0))
+    known = project._cache_size(), _psf._cache_size()
+    fields = {
+        tc.record(CAMERA.replace(distance=d), scene(140.0, far)).imaging_model.field_shape
+        for d, far in ((3.0, 250.0), (2.95, 250.0), (3.0, 255.0))
+    }
+    assert fields == {(28, 28)} and (project._cache_size(), _psf._cache_size()) == known
 
 
 def test_the_field_ends_where_the_sensor_sees_nothing():

@@ -6,14 +6,15 @@ it. Hence the files `command.py` import nothing slow at their heads.
 
 import functools
 import inspect
+import os
 from collections.abc import Callable
 from typing import Annotated, Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from thincam_jax._core.program_cache import cache_state, keep_programs
 from thincam_jax.commands import terminal
-from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
 from thincam_jax.commands.kinds import commands_of_rooms, has_room, init, load_experiment
@@ -169,6 +170,7 @@ def options(
     ] = True,
 ) -> None:
     """Simulate and reconstruct thin computational cameras."""
+    os.environ["THINCAM_CACHE"] = "on" if cache else "off"
     if cache:
         keep_programs()
 

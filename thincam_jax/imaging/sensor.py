@@ -164,15 +164,20 @@ class GaussianNoise(AbstractNoise):
     def variance(
         self, image: Pictures, electrons: Electrons | None = None
     ) -> Float[Array, "*batch"]:
-        if self.signal_power == "total":
-            power = jnp.mean(image**2, axis=(-2, -1))
-        else:
-            power = jnp.var(image, axis=(-2, -1))
-        return power * 10 ** (-self.snr_db.astype(image.dtype) / 10)
+        return _gaussian_variance(self, image)
 
     def add(self, key: PRNGKeyArray, image: Pictures, electrons: Electrons | None) -> Pictures:
         sigma = jnp.sqrt(self.variance(image))[..., None, None]
         return image + sigma * jax.random.normal(key, image.shape, image.dtype)
+
+
+@eqx.filter_jit
+def _gaussian_variance(noise: GaussianNoise, image: Pictures) -> Float[Array, "*batch"]:
+    if noise.signal_power == "total":
+        power = jnp.mean(image**2, axis=(-2, -1))
+    else:
+        power = jnp.var(image, axis=(-2, -1))
+    return power * 10 ** (-noise.snr_db.astype(image.dtype) / 10)
 
 
 class PoissonGaussianNoise(AbstractNoise):

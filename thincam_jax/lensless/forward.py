@@ -33,6 +33,7 @@ def expose(
 ) -> Float[Array, "*batch y x"]:
     """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
     shape = projected_shape(camera, plane)
+    shape = shape if as_method(model, True).field_tolerance else in_steps(shape)
     check_memory(camera.sensor, shape, plane.image.shape[:-2])
     seen = imaging_operator(camera, spectrum, plane.distance, field_shape=shape, model=model)
     return seen(project(camera, plane, shape))
@@ -92,6 +93,15 @@ def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int
     # In steps, so that programs are shared along a way.
     columns += 2 * _STEP * math.ceil(scale * np.abs(moves).max() / _STEP)
     return same_parity((rows, columns), camera.sensor.shape)
+
+
+def in_steps(shape: Sequence[int]) -> tuple[int, int]:
+    """A shape enlarged to steps of a 16th to an 8th of it, of the same parity.
+
+    Programs are shared while a distance or a pitch changes the size of a scene on the sensor.
+    """
+    rows, columns = (n + (n % 2 - n) % 2 ** max(0, int(n).bit_length() - 4) for n in shape)
+    return rows, columns
 
 
 @functools.partial(jax.jit, static_argnames="shape")

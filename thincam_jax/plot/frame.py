@@ -8,7 +8,9 @@ from typing import Any
 
 import matplotlib.figure
 import numpy as np
+import PIL.Image
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import AxesImage
 from matplotlib.text import Text
 
@@ -133,6 +135,12 @@ def as_png(figure: matplotlib.figure.Figure) -> bytes:
                 most = max(1, int(72 * inches / (0.58 * float(text.get_fontsize()))))
                 lines = re.sub("(?<!,) ", "\xa0", text.get_text()).splitlines()
                 text.set_text("\n".join(textwrap.fill(line, most) for line in lines))
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+    shown, dpi, buffer = figure.canvas, figure.dpi, io.BytesIO()
+    figure.set_dpi(110)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # once; savefig draws, and resamples each picture, twice
+    pixels = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba()))
+    pixels.save(buffer, "png", dpi=(110, 110), compress_level=3)  # half the time, and no larger
+    figure.set_canvas(shown)
+    figure.set_dpi(dpi)
     return buffer.getvalue()

@@ -71,6 +71,7 @@ class Cameras(Module):
       where the captures show light beyond them (`outside_light`).
     - `field_height`, `field_width`: in place of it, mm on the (nearest) object; the sensor's where
       only one is given.
+    - `whole_scene`: whether the field holds the whole scene, so that no light is looked for beyond.
     - `model`, `pixel_integration`: how PSFs are computed, see `thincam_jax.psf`. With
       `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
       (`field_operator`), for solvers by iteration. Filters take the PSF of the axis, and divide the
@@ -102,6 +103,7 @@ class Cameras(Module):
     field_width: float | None = eqx.field(
         default=None, converter=_SIDE(), static=True, kw_only=True
     )
+    whole_scene: bool = eqx.field(default=False, converter=bool, static=True, kw_only=True)
     model: Model | PsfMethod = eqx.field(
         default="separable", converter=_model, static=True, kw_only=True
     )
@@ -236,7 +238,8 @@ class Cameras(Module):
         for number, ratio in zip(range(self.count), ratios, strict=True):
             own = own_field(field, ratio)
             planes = [self.own_psf(number, own, distance) for distance in distances]
-            kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
+            own_scale = [k if ratio == 1 else register(k, ratio) / ratio**2 for k in planes]
+            kernels.append(jnp.stack(own_scale)[None])
         return kernels
 
     def own_psf(self, number: int, field: tuple[int, int], distance: Number) -> Float[Array, "k l"]:

@@ -1,8 +1,8 @@
 """Iterate a method in compiled chunks, checking convergence between them.
 
-Between two chunks of iterations a run can report, stop early, adapt and be interrupted. Chunks are
-unrolled: on a CPU, XLA runs the transforms of a compiled loop on one core and those of a straight
-program on all (docs/measured/solvers.md has the comparison).
+Between two chunks of iterations a run can report, stop early, adapt and be interrupted. A chunk is
+one compiled loop: a straight program of ten iterations takes as long to run and twice as long to
+compile (docs/decisions/programs_of_ten.md).
 """
 
 import abc
@@ -58,6 +58,7 @@ class Outcome(eqx.Module):
     """The image with the lowest objective among those checked, and the history of the run.
 
     - `reason`: note about the result for the user; "" for none.
+    - `method`: the method as it was adapted.
     """
 
     image: Image
@@ -66,6 +67,7 @@ class Outcome(eqx.Module):
     iterations: int
     seconds: float
     reason: str = ""
+    method: Any = None
 
 
 class AbstractMethod(eqx.Module, Generic[Method_State]):
@@ -96,6 +98,10 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
     ) -> tuple["AbstractMethod[Method_State]", Method_State]:
         """The method and the state after adapting the method's parameters to the residuals."""
         return self, state
+
+    def like(self, other: "AbstractMethod[Any]") -> "AbstractMethod[Method_State]":
+        """This method with the parameters to which another was adapted."""
+        return self
 
 
 class SolverState(eqx.Module):
@@ -138,9 +144,7 @@ class OptimistixMethod(AbstractMethod[SolverState]):
 
     def advance(self, state: SolverState, count: int):
         run = _advance_donated if self.donated else _advance
-        for size in [UNROLLED] * (count // UNROLLED) + [1] * (count % UNROLLED):
-            state = run(self, state, size)
-        return state
+        return run(self, state, np.int32(count))
 
     def image(self, state: SolverState):
         return _image(self, state)
@@ -155,9 +159,6 @@ Callback = Callable[[Progress], object]
 
 # Iterations between two checks.
 CHUNK = 10
-# Iterations in one program. Each run of a program allocates its memory anew, which takes time for
-# large windows; shared by ten iterations it does not matter. Fewer compile faster.
-UNROLLED = CHUNK
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def iterate(
     began = time.perf_counter()
 
     def judged(image) -> float:
-        return float(jnp.sum((objective or method.objective)(image)))
+        return float(np.sum(np.asarray((objective or method.objective)(image))))
 
     best, history = image, [Progress(done, judged(image), math.nan, math.nan)]
     status: Status = "iterations_exhausted"
@@ -231,7 +232,8 @@ def iterate(
                 method, state = method.adapt(state, residuals)
     except KeyboardInterrupt:
         status = "interrupted"
-    return Outcome(best, status, tuple(history), done, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return Outcome(best, status, tuple(history), done, seconds, method=method)
 
 
 def _settled(history: Sequence[Progress], share: float) -> bool:
@@ -251,13 +253,19 @@ def _start(method: OptimistixMethod, image) -> SolverState:
     return SolverState(value, inside)
 
 
-def _steps(method: OptimistixMethod, state: SolverState, count: int) -> SolverState:
-    for _ in range(count):
+def _steps(method: OptimistixMethod, state: SolverState, count: Any) -> SolverState:
+    """`count` steps: a loop of any length, and the last one, which alone is judged.
+
+    What a solver computes for its residuals only, the compiler drops from the loop.
+    """
+
+    def step(_, state):
         value, inside, _ = method.solver.step(
             method.function, state.value, method.arguments, {}, state.inside, frozenset()
         )
-        state = SolverState(value, inside)
-    return state
+        return SolverState(value, inside)
+
+    return step(0, jax.lax.fori_loop(1, count, step, state))
 
 
 _advance = eqx.filter_jit(_steps)

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 import sys
 import time
 from typing import ClassVar
@@ -347,12 +346,12 @@ class AdmmTV(AbstractRegularised):
         image = finer(first.image, problem.field_shape)
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)
-        second = self._by_admm(problem, image, callback, near=True)
+        second = self._by_admm(problem, image, callback, coarse=first.method)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
 
     def _from_nothing(self, problem, image, callback) -> Outcome:
         """Outcome from a uniform or black image; a biased camera's begins without uniform light."""
-        lit = bool(jnp.any(image != 0))
+        lit = bool(np.any(np.asarray(image)))
         # Whole chunks between two checks: a callback sees every tenth iteration throughout.
         count = CHUNK * round(_FIRST_PART * self.iterations / CHUNK)
         begin = Schedule(count, self.tolerance, adapt_until=min(_BALANCED, count // 2))
@@ -371,14 +370,21 @@ class AdmmTV(AbstractRegularised):
             seconds=first.seconds + second.seconds,
         )
 
-    def _by_admm(self, problem, image, callback, done: int = 0, *, near: bool = False) -> Outcome:
+    def _by_admm(self, problem, image, callback, done: int = 0, *, coarse=None) -> Outcome:
+        """Outcome from an image; with the penalties of a method on coarse pixels, if it is given.
+
+        Those fit these pixels, too. Balanced anew, they follow what the start image lacks in
+        detail: twice to three times the iterations at 40 dB and more.
+        """
         half, planes = (self.iterations - done) // 2, problem.image_shape[-3]
         until = done + (min(_BALANCED, half) if planes == 1 else half)
+        until = 0 if coarse is not None else until
         limits = self.iterations, self.tolerance
         # About its minimum the objective changes by the square of the image's change.
         settled = 10 * self.tolerance * min(1.0, self.tolerance / _FINE)
         schedule = Schedule(*limits, adapt_until=until, done=done, settled=settled)
-        method = in_parallel(problem, functools.partial(admm_method, near=near))
+        method = in_parallel(problem, admm_method)
+        method = method if coarse is None else method.like(coarse)
         return iterate(method, image, schedule, callback=callback)
 
 

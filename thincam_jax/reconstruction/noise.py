@@ -198,9 +198,9 @@ def is_below_black(capture: Float[Array, "*batch y x"], *, by_noise: bool) -> bo
 
     - `by_noise`: whether noise around black is no reason.
     """
-    below = capture < 0
-    if jnp.mean(below) <= _NEGATIVE or not by_noise:
-        return bool(jnp.mean(below) > _NEGATIVE)
+    below = np.asarray(capture) < 0
+    if np.mean(below) <= _NEGATIVE or not by_noise:
+        return bool(np.mean(below) > _NEGATIVE)
     deviation = jnp.sqrt(jnp.mean(estimate_noise(capture) ** 2))
     return bool(jnp.sqrt(jnp.mean(capture**2, where=below)) > _BY_NOISE * deviation)
 

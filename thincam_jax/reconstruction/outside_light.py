@@ -60,13 +60,15 @@ def outside_light(
     model = recording.imaging_model
     if not isinstance(model, Cameras) or model.over_field or problem.image_shape[-3] > 1:
         return None
+    if model.whole_scene:
+        return None
     misfit, field = misfit_of(problem, image), problem.field_shape
     if misfit is None or max(misfit.smooth) < _SUSPECTED:
         return None
     whole = max(model.seen_field[0], field[0]), max(model.seen_field[1], field[1])
     try:
         wide = with_field(recording, whole).problem(
-            tau=problem.tau, nonnegative=bool(image.min() >= 0), synthesis=synthesis
+            tau=problem.tau, nonnegative=bool(np.min(np.asarray(image)) >= 0), synthesis=synthesis
         )
     except MemoryError:
         return None
@@ -122,16 +124,16 @@ def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recordi
 
 
 def pinned(recording: Recording) -> Recording:
-    """A recording that keeps the sensor's field; a field that is given stays."""
+    """A recording that keeps the sensor's field, whatever is beyond; a given one stays."""
     model = recording.imaging_model
     if not isinstance(model, Cameras) or model.pixels is not None:
         return recording
-    return with_field(recording, model.cameras[0].sensor.shape)
+    return with_field(recording, model.cameras[0].sensor.shape, whole=True)
 
 
-def with_field(recording: Recording, shape: tuple[int, int]) -> Recording:
+def with_field(recording: Recording, shape: tuple[int, int], *, whole: bool = False) -> Recording:
     """A recording of `Cameras` with another field."""
-    sides = {"field_shape": shape, "field_height": None, "field_width": None}
+    sides = {"field_shape": shape, "field_height": None, "field_width": None, "whole_scene": whole}
     model = dataclasses.replace(recording.imaging_model, **sides)
     return dataclasses.replace(recording, imaging_model=model)
 

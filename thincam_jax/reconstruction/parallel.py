@@ -15,6 +15,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from thincam_jax._core.environment import usable_cores
 from thincam_jax.imaging.operators import CropConvolution
@@ -44,12 +46,14 @@ class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
         return tuple(_in_threads(lambda m, s: m.advance(s, count), self.methods, state))
 
     def image(self, state: tuple[Any, ...]):
-        images = _in_threads(lambda m, s: m.image(s), self.methods, state)
-        return jnp.stack(images).reshape(self.shape)
+        images = _in_threads(lambda m, s: np.asarray(m.image(s)), self.methods, state)
+        return jnp.asarray(np.stack(images).reshape(self.shape))
 
     def objective(self, image: Image):
-        values = _in_threads(lambda m, i: m.objective(i), self.methods, self._split(image))
-        return jnp.sum(jnp.stack(values).reshape(*self.shape[:-4], -1), axis=-1)
+        values = _in_threads(
+            lambda m, i: np.asarray(m.objective(i)), self.methods, self._split(image)
+        )
+        return jnp.asarray(np.stack(values).reshape(*self.shape[:-4], -1).sum(axis=-1))
 
     def residuals(self, state: tuple[Any, ...]):
         each = tuple(m.residuals(s) for m, s in zip(self.methods, state, strict=True))
@@ -63,8 +67,12 @@ class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
         methods, states = zip(*adapted, strict=True)
         return eqx.tree_at(lambda a: a.methods, self, methods), states
 
+    def like(self, other: AbstractMethod[Any]):
+        pairs = zip(self.methods, other.methods, strict=True)  # type: ignore[attr-defined]
+        return eqx.tree_at(lambda a: a.methods, self, tuple(m.like(o) for m, o in pairs))
+
     def _split(self, image: Image):
-        return list(image.reshape(len(self.methods), -1, *self.shape[-3:]))
+        return _parts(image, (len(self.methods), -1, *self.shape[-3:]))
 
 
 def in_parallel(
@@ -93,7 +101,7 @@ def independent_parts(problem: InverseProblem) -> list[InverseProblem]:
     operators = [
         [_of_colour(o, c, colours) for o in convolutions(problem) or ()] for c in range(colours)
     ]
-    captures = [c.reshape(count, channels // colours, *c.shape[-2:]) for c in problem.captures]
+    captures = [_parts(c, (count, channels // colours, *c.shape[-2:])) for c in problem.captures]
     weights = [
         _weights_of_parts(w, c, count, colours)
         for w, c in zip(problem.weights, problem.captures, strict=True)
@@ -133,10 +141,15 @@ def _weights_of_parts(weight, capture, count: int, colours: int):
     """The weights of each part; a single number serves all."""
     if weight.ndim == 0:
         return [weight] * count
-    weight = weight.reshape((1,) * (capture.ndim - weight.ndim) + weight.shape)
-    leading = jnp.broadcast_shapes(weight.shape[:-2], capture.shape[:-2])
-    whole = jnp.broadcast_to(weight, (*leading, *weight.shape[-2:]))
-    return whole.reshape(count, leading[-1] // colours, *weight.shape[-2:])
+    weight = np.asarray(weight).reshape((1,) * (capture.ndim - weight.ndim) + weight.shape)
+    leading = np.broadcast_shapes(weight.shape[:-2], capture.shape[:-2])
+    whole = np.broadcast_to(weight, (*leading, *weight.shape[-2:]))
+    return _parts(whole, (count, leading[-1] // colours, *weight.shape[-2:]))
+
+
+def _parts(array: Any, shape: tuple[int, ...]) -> list[Array]:
+    """An array's parts along the first axis of a shape; on the host, where nothing is compiled."""
+    return [jnp.asarray(part) for part in np.asarray(array).reshape(shape)]
 
 
 def _in_threads(function: Callable, *sequences) -> list:

@@ -13,7 +13,7 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
-from thincam_jax.lensless.forward import projected_shape
+from thincam_jax.lensless.forward import in_steps, projected_shape
 from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.recording import Recording
@@ -31,7 +31,7 @@ def record(
     """Capture a scene by one camera or several, with all that its reconstruction needs.
 
     The recording has the scene's light and distances, and the field that its planes fill, as far
-    as the sensor sees it.
+    as the sensor sees it: up to an eighth more, in steps, so that another distance seldom compiles.
 
     **Arguments**
 
@@ -75,6 +75,6 @@ def record(
         variances = [float(np.mean(noise.variance(one))) for one in captures]
     if not checks.holds_traced(scene, cameras):
         covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]
-        widest = np.minimum(np.max(covers, axis=0), optics.seen_field)
-        optics = optics.replace(field_shape=tuple(int(n) for n in widest))
+        widest = np.minimum(in_steps(np.max(covers, axis=0).tolist()), optics.seen_field)
+        optics = optics.replace(field_shape=tuple(int(n) for n in widest), whole_scene=True)
     return Recording(captures, optics, noise_variance=variances)

@@ -95,8 +95,8 @@ def first_image(
     """The start image, padded with zeros to the field; by default uniform, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
-        level = compiled_level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
-        return jnp.broadcast_to(level, shape)
+        level = compiled_level(problem)[..., None, None, None] if uniform else np.zeros((), dtype)
+        return jnp.asarray(np.broadcast_to(np.asarray(level), shape))
     start = checks.array("start", start).astype(dtype)
     if not checks.is_traced(start) and not bool(jnp.isfinite(start).all()):
         raise ValueError("start holds NaN or infinity; give a finite image")

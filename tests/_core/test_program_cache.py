@@ -9,14 +9,17 @@ from pathlib import Path
 import pytest
 from commands.test_cli import call
 
+import thincam_jax as tc
 from helpers import ROOT
-from thincam_jax.commands import cache, cli
+from thincam_jax._core import program_cache as cache
+from thincam_jax.commands import cli
 
 
 @pytest.fixture
 def environment(monkeypatch, tmp_path):
     """Without settings of JAX's cache, and put back afterwards."""
     names = [name for name in os.environ if name.startswith(("JAX_COMPILATION", "JAX_PERSISTENT"))]
+    names.append("THINCAM_CACHE")
     for name in (*names, *cache._SETTINGS, "JAX_COMPILATION_CACHE_DIR"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
@@ -60,6 +63,16 @@ def test_what_the_user_has_told_jax_stands(environment, monkeypatch, tmp_path):
     assert "JAX_COMPILATION_CACHE_MAX_SIZE" not in os.environ
     assert not environment.exists()
     assert cache.cache_state() == f"{tmp_path / 'mine'}, 0.0 MiB"
+
+
+@pytest.mark.parametrize("switch", ["on", "off"])
+def test_the_first_name_that_a_script_takes_has_jax_keep_programs(environment, monkeypatch, switch):
+    monkeypatch.setenv("THINCAM_CACHE", switch)
+    tc.units  # noqa: B018 (JAX is imported, and has begun with its own settings)
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    monkeypatch.delitem(sys.modules, "jax")
+    tc.__getattr__("units")
+    assert ("JAX_COMPILATION_CACHE_DIR" in os.environ) == (switch == "on")
 
 
 def test_folder_that_cannot_be_made(environment, monkeypatch, tmp_path):

@@ -1,7 +1,8 @@
-"""The compiled programs that commands keep from one run to the next, in the user's cache folder.
+"""Compiled programs are kept from one process to the next, in the user's cache folder.
 
-JAX keeps them. It learns so from the environment, before it is imported: `thincam --help` need
-not wait for JAX, and worker processes keep their programs in the same folder.
+JAX keeps them. It learns so from the environment, before it is imported: by a command, or by the
+first name of `thincam_jax` that a script takes. `thincam --help` need not wait for JAX, and worker
+processes keep their programs in the same folder.
 """
 
 import os
@@ -14,7 +15,7 @@ LARGEST = 2**30  # bytes; beyond, JAX drops what was not used for longest
 
 _SETTINGS = {
     "JAX_COMPILATION_CACHE_MAX_SIZE": str(LARGEST),
-    # A command has many small programs, of which most take longer to compile than to read.
+    # There are many small programs, of which most take longer to compile than to read.
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     # XLA takes the processor for another one and says so in 4 kB for each program that it reads
     # (https://github.com/jax-ml/jax/issues/38445). What fails is an exception anyway.
@@ -34,12 +35,13 @@ def cache_folder() -> Path:
 
 
 def keep_programs() -> None:
-    """Have JAX keep what it compiles, unless the user has said where.
+    """Have JAX keep what it compiles, unless the user has said where, or THINCAM_CACHE=off.
 
     Where the folder cannot be written, nothing is kept and nothing is said; where another process
     holds it, a line says so.
     """
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+    is_off = os.environ.get("THINCAM_CACHE", "").lower() in ("0", "off", "no", "false", "n", "f")
+    if is_off or "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     from filelock import FileLock, Timeout
 
