@@ -180,16 +180,22 @@ def options(
 def doctor(
     devices: Annotated[bool, typer.Option(help="What is connected, by looking alone.")] = False,
     ask: Annotated[str | None, typer.Option(help="A serial port to ask what it is.")] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Versions, precisions and drivers, too.")
+    ] = False,
 ) -> None:
-    """Print versions, devices and what is missing."""
+    """Say what can be done here and what is missing."""
     with reported(lambda: "interrupted"):
-        from thincam_jax._core.environment import machine_report, package_report
+        from thincam_jax._core.environment import machine_report, package_report, verdict
 
-        programs = f"compiled programs: {cache_state()}"
-        hardware = []
-        if has_room("hardware"):
+        lines = verdict()
+        if everything:
+            programs = f"compiled programs: {cache_state()}"
+            lines += [*machine_report(), programs, *package_report()]
+        else:
+            lines.append("versions, precisions and drivers: thincam doctor --all")
+        if (everything or devices or ask) and has_room("hardware"):
             from thincam_jax.hardware.commands.command import known_drivers
 
-            hardware = known_drivers(devices, ask)
-        lines = [*machine_report(), programs, *package_report(), *hardware]
+            lines += known_drivers(devices, ask)
         say_result("report", lines, "\n".join(lines))

@@ -40,7 +40,7 @@ Count = Annotated[int, Field(ge=1, le=65536)]
 
 
 class DeviceConfig(Section):
-    """A device by the name of its driver (`thincam doctor` lists them), and its options."""
+    """A device by the name of its driver (`thincam doctor --all` lists them), and its options."""
 
     driver: Name
     options: dict[str, Any] = {}
