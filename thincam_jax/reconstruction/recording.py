@@ -152,7 +152,7 @@ class Recording(Module):
             "tau": tau,
             "regulariser": regulariser,
             "nonnegative": nonnegative,
-            "background": self._kind_of_background(captures, synthesis),
+            "background": self._kind_of_background(captures, synthesis, nonnegative),
         }
         operators = self._operators()
         if operators:
@@ -323,7 +323,7 @@ class Recording(Module):
             )
         return tuple(each)
 
-    def _kind_of_background(self, captures, synthesis: Any) -> Background:
+    def _kind_of_background(self, captures, synthesis: Any, nonnegative: bool) -> Background:
         """Not negative but in differences of captures, and if something was subtracted before."""
         if self.background is not None or isinstance(self.imaging_model, Stacked):
             return "known"
@@ -333,7 +333,13 @@ class Recording(Module):
         with jax.ensure_compile_time_eval():  # captures that are known stay so under jit
             below = any(is_below_black(c, by_noise=is_open) for c in known)
         mixed = synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))
-        return "unknown" if below or mixed else "nonnegative"
+        return "nonnegative" if nonnegative and not (below or mixed) else "unknown"
+
+    @property
+    def is_above_black(self) -> bool:
+        """Whether a background to find is not negative."""
+        captures, _ = self._masked_captures()
+        return self._kind_of_background(captures, None, nonnegative=True) == "nonnegative"
 
     @property
     def light(self) -> tuple[Float[Array, "..."], ...]:

@@ -193,7 +193,8 @@ class Ridge(AbstractSolver):
         problem = recording.problem(nonnegative=False, synthesis=self.synthesis)
         # Sums in which the uniform light cancels do not show how bright the scene is; captures do.
         level, mean = _uniform(
-            problem if self.synthesis is None else recording.problem(nonnegative=False)
+            problem if self.synthesis is None else recording.problem(nonnegative=False),
+            is_bounded=recording.is_above_black,
         )
         given = 1.0 if isinstance(self.ridge, str) else self.ridge * image_precision(level)
         tried = []
@@ -208,10 +209,10 @@ class Ridge(AbstractSolver):
         return min(tried, key=operator.itemgetter(0))[1]
 
 
-@jax.jit
-def _uniform(problem: InverseProblem):
+@functools.partial(jax.jit, static_argnames="is_bounded")
+def _uniform(problem: InverseProblem, *, is_bounded: bool):
     """Level of the uniform image, and that image, not negative."""
-    level = scene_level(problem)
+    level = scene_level(problem, is_bounded=is_bounded)
     level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
     return level, jnp.maximum(level, 0)[..., None, None, None]
 
