@@ -65,7 +65,8 @@ def diffuser():
 def zone_aperture():
     mask = tc.FresnelZoneAperture(17.0, width=3.0)
     camera = tc.LenslessCamera(mask, tc.Sensor(SENSOR, 0.044), 7.5)
-    psf = np.asarray(tc.psf(camera, wavelength=500 * nm, object_distance=100.0), float)
+    light = {"wavelength": 500 * nm, "object_distance": 100.0, "pixel_integration": False}
+    psf = np.asarray(tc.psf(camera, **light), float)
     return psf / psf.sum()
 
 

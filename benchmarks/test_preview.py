@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from helpers import ROOT
-from thincam_jax.commands.capture import command
-from thincam_jax.commands.capture.config import CaptureConfig
-from thincam_jax.commands.capture.run import build_study
 from thincam_jax.commands.checked_config import load_as
+from thincam_jax.hardware.commands import command
+from thincam_jax.hardware.commands.config import CaptureConfig
+from thincam_jax.hardware.commands.run import build_study
 from thincam_jax.hardware.preview import Preview
+from thincam_jax.hardware.studies.images import live_image
 from thincam_jax.plot.page import page_of
-from thincam_jax.studies.rig_images import live_image
 
 FRAMES, SKIPPED = 200, 20  # those before are compiled for
 

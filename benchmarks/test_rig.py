@@ -9,10 +9,10 @@ import time
 import jax
 
 from helpers import ROOT
-from thincam_jax.commands.capture import command
-from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
+from thincam_jax.hardware.commands import command
+from thincam_jax.hardware.commands.config import CaptureConfig
 
 FRAMES = 480
 CELLS, PIXELS, PITCH = "[64, 64]", "[512, 512]", "4.125 um"

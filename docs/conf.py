@@ -93,7 +93,7 @@ PACKAGES = (
 MODULES = (
     "design.phase_mask",
     "design.phase_retrieval",
-    "design.plate",
+    "waveguide.design.plate",
     "design.relief_files",
     "hardware.acquisition.plan",
     "hardware.acquisition.taker",
@@ -126,7 +126,7 @@ MODULES = (
     "lensless.propagation.angular_spectrum",
     "measured.bayer",
     "measured.calibration.hadamard",
-    "measured.calibration.screen_fit",
+    "waveguide.measured.screen_fit",
     "measured.examination",
     "measured.exposures",
     "reconstruction.iterate",
@@ -178,9 +178,10 @@ def reference_page(package: str, seen: set[tuple[str, str]]) -> str:
     """Tables of the names of a package that stand on no earlier page."""
     groups: dict[str, list[str]] = {title: [] for title in ROOMS.values() if package == TOP}
     for node in source(package).body:
-        if isinstance(node, ast.ImportFrom) and node.module:
+        if isinstance(node, ast.ImportFrom) and (node.module or package != TOP):
             for alias in (one for one in node.names if one.asname):  # `x as x`: public
-                module = f"{package}.{node.module}" if node.level else node.module
+                inside = ".".join(filter(None, (package, node.module)))
+                module = inside if node.level else node.module
                 named = getattr(importlib.import_module(package), alias.name)
                 made_in = getattr(named, "__module__", module)  # "typing" of an alias of types
                 module = made_in if made_in.startswith(TOP) else module

@@ -15,7 +15,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests"))
 from source_tree import PACKAGE, read_package  # noqa: E402
-from test_architecture import FLOORS, OUTSIDE, OUTSIDE_USES, PLOT  # noqa: E402
+from test_architecture import CLOSED, FLOORS, OUTSIDE, OUTSIDE_USES, PLOT, room, room_of  # noqa: E402
 
 PICTURE = ROOT / "docs/images/rooms.png"
 WIDTH, HEIGHT = 0.96, 0.64  # of a box, in steps
@@ -25,7 +25,8 @@ LINE = {"color": "0.45", "lw": 1.4}
 def rooms_and_imports() -> dict[str, tuple[int, list[str]]]:
     """The lines of each room and the rooms that it imports, lowest floor first.
 
-    But `plot` below it: only methods `plot` of results import it, when they are called.
+    But `plot` below it: only methods `plot` of results import it, when they are called. What a
+    closed room has on higher floors counts to its lines, and imports for the room of that floor.
     """
     names = []
     for floor in FLOORS:
@@ -33,7 +34,9 @@ def rooms_and_imports() -> dict[str, tuple[int, list[str]]]:
     rooms, package = {}, read_package(ROOT / PACKAGE)
     for name in names:
         modules = [module for module in package if module.top == name]
-        imported = {tuple(to.split(".")[:2]) for module in modules for _, to in module.imports}
+        here = [module for module in package if room(module) == name]
+        names_in = [to.split(".") for module in here for _, to in module.imports]
+        imported = {(to[0], room_of(to[1:])) for to in names_in if to[1:]}
         used = [
             other
             for place, other in enumerate(names)
@@ -83,6 +86,8 @@ def draw(picture: Path = PICTURE) -> None:
     )
     if OUTSIDE in rooms:
         words += f"\n{OUTSIDE} stands on no floor: only its command imports it."
+    if closed := [name for name in CLOSED if name in rooms]:
+        words += f"\n{', '.join(closed)} may be left out with all that is theirs."
     axes.text(count - 0.55, 0.0, words, ha="right", va="center", fontsize=9)
     axes.set(xlim=(-0.65, count - 0.35), ylim=(-0.5, count - 0.5))
     axes.axis("off")

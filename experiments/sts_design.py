@@ -20,7 +20,10 @@ import numpy as np
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
-from thincam_jax.design.plate import (
+from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.targets import middle_square, resize, sample_image
+from thincam_jax.units import deg, um
+from thincam_jax.waveguide.design.plate import (
     Plate,
     PlateLimits,
     Viewing,
@@ -28,9 +31,6 @@ from thincam_jax.design.plate import (
     judge_plate,
     noise_variance,
 )
-from thincam_jax.imaging.metrics import psnr, ssim
-from thincam_jax.imaging.targets import middle_square, resize, sample_image
-from thincam_jax.units import deg, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels, cells and steps
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_design"

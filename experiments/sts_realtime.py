@@ -25,8 +25,8 @@ from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Sparse
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.measured.calibration import fit_screen
-from thincam_jax.measured.calibration.screen_fit import GhostPositions
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.measured.screen_fit import GhostPositions
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels and cells, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_realtime"

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import resource
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -30,13 +31,18 @@ def shared_data(name: str) -> Path:
 
 @contextlib.contextmanager
 def full_disk(size: int) -> Iterator[None]:
-    """No file takes more than so many bytes: writing ends as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    """No file takes more than so many bytes: writing ends as on a full disk.
+
+    Not Python's compiled modules: it would leave them cut off for the next process.
+    """
+    before, writes = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    sys.dont_write_bytecode = True
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = writes
 
 
 def read_fiducial(pixels: Any, bit_depth: int) -> Any:

@@ -24,7 +24,6 @@ from thincam_jax.design.objectives import (
 )
 from thincam_jax.design.phase_mask import MaskSetting, mask_of_phase, one_turn
 from thincam_jax.design.phase_retrieval import contour_target
-from thincam_jax.design.plate import Plate, Viewing, judge_plate
 from thincam_jax.design.ranking import score_design
 from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
@@ -47,6 +46,7 @@ from thincam_jax.measured.calibration.hadamard import hadamard_pattern, walsh_ha
 from thincam_jax.measured.calibration.start import PsfSearch
 from thincam_jax.measured.read import list_captures
 from thincam_jax.measured.write import log_text
+from thincam_jax.waveguide.design.plate import Plate, Viewing, judge_plate
 
 
 def space(base: Any, variable: Any, limits: Any) -> design.DesignSpace:

@@ -4,6 +4,7 @@ Each rule is a function from the parsed modules to a list of complaints. It is a
 package and, below, to small packages that break it: a rule that has gone blind is noticed.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -33,17 +34,31 @@ FLOORS = (
     ("plot",),
     ("commands",),
 )
-# The rig stands outside: it may use what captures need, and only its command knows of it.
+# The rig stands outside: it may use what captures need, and only commands know of it.
 OUTSIDE, OUTSIDE_USES = "hardware", "measured"
+# Rooms that can be left out with all that is theirs: `waveguide/studies/` stands on the floor of
+# `studies`, `hardware/commands/` on that of `commands`, and nobody else waits for them.
+CLOSED = ("hardware", "waveguide", "learn")
 ROOMS = (*(room for floor in FLOORS for room in floor), OUTSIDE)
 FLOOR = {room: height for height, floor in enumerate(FLOORS) for room in floor}
 MOST_ENTRIES = 14
 
 JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-PLOT = "plot"  # draws with matplotlib; what has a `plot` method imports it in that method
+PLOT = "plot"  # draws with matplotlib; a method that draws imports the file that draws it
 FRONT_END = "commands"
 ARRAY_LIBRARIES = ("jax", "jaxlib", "jaxtyping")
+
+
+def room_of(parts: Sequence[str]) -> str:
+    """Room on whose floor a file stands: `plot` for ("learn", "plot"), `learn` for ("learn",)."""
+    inner = parts[1] if parts[0] in CLOSED and len(parts) > 1 else ""
+    return inner if inner in FLOOR else parts[0]
+
+
+def room(module: Module) -> str:
+    """`room_of` of a file."""
+    return room_of(Path(module.path).with_suffix("").parts)
 
 
 def unknown_rooms(modules: list[Module]) -> list[str]:
@@ -63,43 +78,100 @@ def crowded_roots(modules: list[Module]) -> list[str]:
 
 
 def imports_against_the_floors(modules: list[Module]) -> list[str]:
-    complaints = []
+    complaints, drawing = [], floors_of_figures(modules)
     for module in modules:
+        own = room(module)
         for line, name in module.imports:
             parts = name.split(".")
-            if parts[0] != PACKAGE:
-                continue
-            where = f"{module.path}:{line}"
-            target = parts[1] if len(parts) > 1 else None
-            if target == module.top or module.top not in (*ROOMS, *ENTRY):
+            if parts[0] != PACKAGE or (module.top not in (*ROOMS, *ENTRY)):
                 continue  # a room without a floor is told by the rule above
+            where = f"{module.path}:{line}"
+            target = room_of(parts[1:]) if len(parts) > 1 else None
+            if target == own:
+                continue
             if target == OUTSIDE:
                 lazy = module.path == "__init__.pyi" and parts[2:] == []
-                if not lazy and not may_use_the_rig(module, line):
+                command = own == FRONT_END and (module.top == OUTSIDE or waits(module, line))
+                if not lazy and not command and module.top != OUTSIDE:
                     complaints.append(
-                        f"{where}: imports {OUTSIDE}, which only its command may, inside a function"
+                        f"{where}: imports {OUTSIDE}, which only a command may, inside a function"
                     )
             elif target not in FLOOR:
                 complaints.append(
                     f"{where}: imports {name} from the top of the package, which imports "
                     "everything: import it from the module that defines it"
                 )
-            elif module.top == OUTSIDE and FLOOR[target] > FLOOR[OUTSIDE_USES]:
+            elif own == OUTSIDE and FLOOR[target] > FLOOR[OUTSIDE_USES]:
                 complaints.append(f"{where}: {OUTSIDE} imports {target}, above {OUTSIDE_USES}")
-            elif module.top in FLOOR and FLOOR[target] >= FLOOR[module.top]:
-                if {module.top, target} != {"units", "_core"}:
-                    if target != PLOT or not waits(module, line):
-                        complaints.append(
-                            f"{where}: {module.top} imports {target}, which is no lower"
-                        )
+            elif own in FLOOR and FLOOR[target] >= FLOOR[own]:
+                height = drawing.get(".".join(parts[:3]), FLOOR[target])
+                figure = waits(module, line) and height <= FLOOR[own]
+                if {own, target} != {"units", "_core"} and not figure:
+                    complaints.append(f"{where}: {own} imports {target}, which is no lower")
     return complaints
 
 
-def may_use_the_rig(module: Module, line: int) -> bool:
-    """A command's file may, where the import waits for the command to be called, and the file of
-    its sections, which are read from the constructors and loaded when the command is called."""
-    name = Path(module.path).name if module.top == FRONT_END else ""
-    return name == "config.py" or (name == "command.py" and waits(module, line))
+def imports_across_borders(modules: list[Module]) -> list[str]:
+    """What belongs to a closed room is imported by others when they are asked for it: inside a
+    function, for annotations only, or by a face that is lazy."""
+    return [
+        f"{module.path}:{line}: imports {name}, which may have been left out: import it inside the "
+        "function that needs it"
+        for module in modules
+        for line, name in module.imports_at_run_time
+        if name.split(".")[0] == PACKAGE
+        and (owner := [*name.split("."), ""][1]) in CLOSED
+        and owner != module.top
+        and Path(module.path).name != "__init__.pyi"
+        and not waits(module, line)
+    ]
+
+
+def floors_of_figures(modules: list[Module]) -> dict[str, int]:
+    """Floor of each file of `plot`: that of the highest room that it imports when it runs.
+
+    So what it draws may stand below the room, and import the file where it is asked for a figure.
+    """
+    paths = {m: (PACKAGE, *Path(m.path).with_suffix("").parts) for m in modules if room(m) == PLOT}
+    files = {".".join(path[:3]): module for module, path in paths.items()}
+
+    def height(name: str, above: tuple[str, ...] = ()) -> int:
+        imported = [one.split(".") for _, one in files[name].imports_at_run_time]
+        inside = [parts[1:] for parts in imported if parts[0] == PACKAGE and parts[1:]]
+        rooms = [FLOOR.get(room_of(parts), 0) for parts in inside]
+        figures = {".".join(parts[:3]) for parts in imported} & files.keys() - {*above, name}
+        rooms = [room for room in rooms if room != FLOOR[PLOT]]
+        return max([0, *rooms, *(height(one, (*above, name)) for one in figures)])
+
+    return {name: height(name) for name in files}
+
+
+def circles_through_figures(modules: list[Module]) -> list[str]:
+    """A file of `plot` does not import, by others or lazily, what imports it to be drawn."""
+    files = {
+        f"{PACKAGE}.{Path(m.path).with_suffix('').as_posix()}".replace("/", "."): m for m in modules
+    }
+    uses = {
+        name: {
+            found
+            for _, one in module.imports_at_run_time
+            if (found := one if one in files else one.rpartition(".")[0]) in files
+        }
+        for name, module in files.items()
+    }
+
+    def reaches(start: str) -> set[str]:
+        found, new = set(), {start}
+        while new:
+            new = {other for one in new for other in uses[one]} - found
+            found |= new
+        return found
+
+    return [
+        f"{module.path}: draws what it imports itself: import that for annotations only"
+        for name, module in files.items()
+        if room(module) == PLOT and name in reaches(name)
+    ]
 
 
 def modules_hidden_by_names(modules: list[Module]) -> list[str]:
@@ -132,8 +204,8 @@ def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
         for module in modules
         for line, name in module.imports_at_run_time
         if name.split(".")[0] in FRONT_END_LIBRARIES
-        and module.top != FRONT_END
-        and (module.top, name.split(".")[0]) != (PLOT, "matplotlib")
+        and room(module) != FRONT_END
+        and (room(module), name.split(".")[0]) != (PLOT, "matplotlib")
     ]
 
 
@@ -143,7 +215,7 @@ def arrays_in_commands(modules: list[Module]) -> list[str]:
         f"{module.path}:{line}: imports {name.split('.')[0]}; move what computes into the library"
         for module in modules
         for line, name in module.imports
-        if name.split(".")[0] in ARRAY_LIBRARIES and module.top == FRONT_END
+        if name.split(".")[0] in ARRAY_LIBRARIES and room(module) == FRONT_END
     ]
 
 
@@ -156,6 +228,8 @@ RULES = (
     unknown_rooms,
     crowded_roots,
     imports_against_the_floors,
+    imports_across_borders,
+    circles_through_figures,
     modules_hidden_by_names,
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
@@ -213,7 +287,7 @@ def test_a_script_on_commands_is_seen(tmp_path, line):
 
 
 # rule, file, source, part of the complaint
-UP = imports_against_the_floors
+UP, BORDER = imports_against_the_floors, imports_across_borders
 BROKEN = [
     (unknown_rooms, "extras.py", DOC, "'extras' has no floor"),
     (unknown_rooms, "extras/deep.py", DOC, "give it one in FLOORS"),
@@ -229,13 +303,27 @@ BROKEN = [
     (UP, "lensless/psf.py", "from .. import Sensor", "from the top"),
     (UP, "hardware/stage.py", "from ..design import x", "above measured"),
     (UP, "hardware/stage.py", "from ..commands.cli import x", "above measured"),
-    (UP, "design/space.py", "from ..hardware import x", "only its command may"),
+    (UP, "design/space.py", "from ..hardware import x", "only a command may"),
     (UP, "commands/rig/command.py", "from ...hardware import x", "inside a function"),
-    (UP, "commands/cli.py", "def f():\n    from ..hardware import x", "only its command may"),
-    (UP, "__init__.py", "from . import hardware", "only its command may"),
+    (UP, "hardware/studies/rig.py", "from ..commands import x", "studies imports commands"),
+    (UP, "learn/commands/run.py", "from ...hardware.base import x", "inside a function"),
+    (UP, "waveguide/rays.py", "from .studies import x", "waveguide imports studies"),
+    (UP, "waveguide/studies/mask.py", "from ...plot import high", "studies imports plot"),
+    (BORDER, "commands/cli.py", "from ..learn.commands.command import x", "left out"),
+    (BORDER, "hardware/studies/rig.py", "from thincam_jax import waveguide as wg", "left out"),
+    (BORDER, "plot/curves.py", "import thincam_jax.learn.training", "inside the function"),
+    (arrays_in_commands, "learn/commands/a.py", "import jax", "learn/commands/a.py:1: imports jax"),
+    (UP, "__init__.py", "from . import hardware", "only a command may"),
     (UP, "design/space.py", "from ..plot import curves", "which is no lower"),
+    (UP, "design/space.py", "def f():\n    from ..plot import curves, high", "which is no lower"),
     (UP, "plot/curves.py", "from ..commands import page", "which is no lower"),
-    (UP, "__init__.pyi", "from .hardware.stage import Stage as Stage", "only its command may"),
+    (
+        circles_through_figures,
+        "plot/curves.py",
+        "def f():\n    from ..design.landscape import x",
+        "plot/curves.py: draws what",
+    ),
+    (UP, "__init__.pyi", "from .hardware.stage import Stage as Stage", "only a command may"),
     (modules_hidden_by_names, "lensless/__init__.py", "from .psf import psf", "psf hides the"),
     (modules_hidden_by_names, "lensless/__init__.py", "from ..units import masks", "masks hides"),
     (modules_hidden_by_names, "__init__.pyi", "from .lensless.psf import units", "units hides"),

@@ -26,8 +26,8 @@ import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax.commands import cli
 from thincam_jax.commands.kinds import load_experiment
-from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
+from thincam_jax.learn.commands.refocusing import build_camera
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.measured.write import log_text
 from thincam_jax.units import nm, um

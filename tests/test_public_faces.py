@@ -23,12 +23,12 @@ FACES = (
 MODULES = (
     *("design.end_to_end", "design.fronts", "design.match"),
     *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
-    *("design.plate", "design.ranking", "design.sensitivity"),
+    *("waveguide.design.plate", "design.ranking", "design.sensitivity"),
     *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
     "lensless.masks.reliefs",
-    *("measured.calibration.screen_fit", "measured.exposures", "measured.sensor"),
+    *("waveguide.measured.screen_fit", "measured.exposures", "measured.sensor"),
     *("reconstruction.depth.find", "reconstruction.problem"),
-    *("studies.evaluate", "studies.prepared", "studies.rig_images", "waveguide.distance"),
+    *("studies.evaluate", "studies.prepared", "hardware.studies.images", "waveguide.distance"),
     *("studies.response", "studies.study", "waveguide.colours"),
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )

@@ -1,4 +1,4 @@
-"""The recipes of CONTRIBUTING.md, followed; that of a device in tests/commands/capture."""
+"""The recipes of CONTRIBUTING.md, followed; that of a device in tests/hardware/commands."""
 
 import re
 import sys

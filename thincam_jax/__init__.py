@@ -28,13 +28,10 @@ which `thincam --help` need not wait for.
 
 import sys
 
-import lazy_loader
-
-from thincam_jax._core.names import modules_of
+from thincam_jax._core.names import lazy_face
 
 # Without `__all__`, for which `help` would print every class in full.
-_names, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
-_attribute = modules_of(__name__, _names)
+_attribute, __dir__ = lazy_face(__name__)
 
 
 def __getattr__(name: str):

@@ -23,11 +23,14 @@ def test_environment_is_that_of_this_process():
 
 def test_package_that_is_not_installed(monkeypatch):
     monkeypatch.setattr(installation, "PACKAGES", ("jax", "no-such-package-at-all"))
-    monkeypatch.setattr(
-        installation, "OPTIONAL", {"pytest": "tests", "no-such-package-at-all": "tea"}
-    )
     assert installation.environment()["versions"]["no-such-package-at-all"] is None
-    assert list(installation.installed(installation.OPTIONAL)) == ["pytest"]
+    assert list(installation.installed(["pytest", "no-such-package-at-all"])) == ["pytest"]
+
+
+def test_every_extra_for_users_is_told():
+    """Those of pyproject.toml, but for the tools of developers."""
+    extras = set(metadata.metadata("thincam_jax").get_all("Provides-Extra") or ())
+    assert extras - {"test", "dev", "docs", "bench", "pylablib"} == set(installation.EXTRAS)
 
 
 def test_precisions_with_and_without_float64():

@@ -280,26 +280,30 @@ def test_ctrl_c_at_any_moment(code, streams):
 
 
 def test_doctor():
-    result = call("doctor")
+    result = call("doctor", "--all")
     assert result.exit_code == 0
     found = installation.environment()
     lines = result.stdout.splitlines()
+    assert lines[0].startswith("ready: simulate, reconstruct, design, ")
     assert f"Python {found['python']} on {found['platform']}" in lines
     assert "devices: " + ", ".join(found["devices"]) in lines
     assert any(line.startswith(f"cores: {installation.usable_cores()}; memory: ") for line in lines)
-    assert f"optional hypothesis {version('hypothesis')}" in lines
     assert "  float64: yes" in lines
     assert "  compiled sums: right" in lines
     assert f"jax {found['versions']['jax']}" in lines
     assert f"compiled programs: {cache_state()}" in lines
 
 
-def test_doctor_tells_what_is_missing(monkeypatch):
+def test_doctor_begins_with_a_verdict(monkeypatch):
+    """And no more than that, but for what an extra brings."""
+    real = installation.installed
+    monkeypatch.setattr(installation, "installed", lambda names: real({*names} - {"dask"}))
+    first, missing, more = call("doctor").stdout.splitlines()
+    assert first.startswith("ready: simulate, reconstruct, design, ") and "sweeps" not in first
+    assert missing == "not installed: sweeps (dask); pip install 'thincam-jax[sweep]'"
+    assert more.endswith("thincam doctor --all")
     monkeypatch.setattr(installation, "PACKAGES", ("no-such-package",))
-    monkeypatch.setattr(installation, "OPTIONAL", {"no-such-part": "making tea"})
-    lines = call("doctor").stdout.splitlines()
-    assert "no-such-package NOT INSTALLED" in lines
-    assert "optional no-such-part is missing: making tea" in lines
+    assert call("doctor").stdout.startswith("not ready: no-such-package is not installed\n")
 
 
 def test_help_is_in_the_order_of_use():

@@ -12,11 +12,11 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
-from commands.capture import tiny as capture
 from commands.design import tiny as design
-from commands.learned.test_train_denoiser import FILE as TRAINING
 from commands.reconstruct import simulated
 from commands.sweep import mini
+from hardware.commands import tiny as capture
+from learn.commands.test_train_denoiser import FILE as TRAINING
 
 from helpers import ROOT
 from thincam_jax.commands.interrupt import INTERRUPTED
@@ -198,7 +198,13 @@ GUARDED = {"JAX_TRANSFER_GUARD": "disallow", "JAX_NUMPY_RANK_PROMOTION": "raise"
         (["schema", "study"], "", ASCII, 0, "fill_factor \\u2264 1"),
         (["doctor"], "", {"MPLBACKEND": "banana"}, 0, "devices: cpu:0"),
         (["doctor"], "", NO_GPU, 2, "JAX cannot start with JAX_PLATFORMS=cuda"),
-        (["doctor"], "", GUARDED, 2, "JAX_TRANSFER_GUARD=disallow forbids arrays of files; unset"),
+        (
+            ["doctor"],
+            "",
+            GUARDED,
+            2,
+            "JAX_TRANSFER_GUARD=disallow forbids to read a file into an array",
+        ),
         (["doctor"], NO_PRINT, {}, 2, "No space left on device"),
         (["--version"], NO_PRINT, {}, 2, "No space left on device"),
         (["schema", "study"], NO_PRINT, {}, 2, "No space left on device"),

@@ -7,9 +7,9 @@ import subprocess
 import sys
 
 import pytest
-from commands.learned.test_train_denoiser import FILE
 from commands.reconstruct.simulated import grey_files
 from commands.sweep import mini
+from learn.commands.test_train_denoiser import FILE
 
 from helpers import ROOT
 

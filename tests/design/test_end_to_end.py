@@ -18,6 +18,7 @@ from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.stochastic import stochastic_descent
 from thincam_jax.design.training import ConjugateGradients, TrainedSensor, Training
 from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SENSOR, IMAGE = (20, 24), 14
@@ -64,7 +65,10 @@ compiled_error = eqx.filter_jit(counted_error)
 
 
 def dense(chosen, given):
-    """Every linear map as a matrix, made one basis image at a time from `tc.psf` and sums."""
+    """Every linear map as a matrix, made one basis image at a time from `tc.psf` and sums.
+
+    Pixel averages have the nodes of numbers that are traced, as designs are.
+    """
     pitch = 1.92 / max(SENSOR)
     sensor = tc.Sensor(SENSOR, pitch)
     rows, columns = given.field_shape
@@ -80,7 +84,7 @@ def dense(chosen, given):
             camera.on_grid(grid),
             wavelength=chosen.wavelength[k],
             object_distance=100.0,
-            pixel_integration=True,
+            model=tc.PsfMethod(nodes=PIXEL_NODES),
         )
         kernel = np.asarray(kernel)[::-1, ::-1] * pitch**2
         project = [

@@ -15,8 +15,8 @@ from refocusing_scores import capture_scene, flat_scene, scores
 
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera
 from thincam_jax.learn.checkpoint import CheckpointError, network_description, write_arrays
+from thincam_jax.learn.commands.refocusing import LearnedConfig, build_camera
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork

@@ -24,6 +24,7 @@ from thincam_jax.reconstruction.problem import (
     uniform_level,
 )
 from thincam_jax.reconstruction.ridge import solve_ridge
+from thincam_jax.reconstruction.splittings import splitting_of
 
 RNG = np.random.default_rng(65)
 SHAPE = (11, 14)  # of the sensor
@@ -106,6 +107,48 @@ def test_dense_normal_equations_know_it():
         normal = normal_equations(problem, jnp.asarray(0.3))
         right = jnp.asarray(RNG.random(problem.image_shape))
         np.testing.assert_allclose(normal.applied(normal.solve(right)), right, atol=1e-10)
+
+
+def matrices():
+    """A splitting of matrices with two backgrounds ≥ 0, a state of it, and captures."""
+    random = np.random.default_rng(4)
+    operators = [Matrix(random.random((20, 12)), (3, 4), (4, 5)) for _ in range(2)]
+    weights, captures = random.random((2, 2, 1, 4, 5))
+    captures = jnp.asarray(captures[0]) + 4, jnp.asarray(captures[1])
+    given = {"weights": list(weights), "background": "nonnegative"}
+    splitting = splitting_of(InverseProblem(operators, list(captures), **given))
+    return splitting, splitting.start(jnp.asarray(random.random((1, 1, 3, 4)))), captures
+
+
+def test_the_data_of_other_operators_have_backgrounds_above_zero():
+    """ADMM's proximal map by scipy, where one of two backgrounds would be negative.
+
+    A map with free ones converged to an image that was no minimum of the objective.
+    """
+    splitting, state, _ = matrices()
+    (matrix, weights, seen), pull = dense(splitting.problem), splitting.penalties.data**0.5
+    levels, root = np.kron(np.eye(2), np.ones((20, 1))), np.sqrt(weights)
+    system = np.block([[root[:, None] * matrix, root[:, None] * levels], [pull * np.eye(12, 14)]])
+    right = np.r_[root * seen, pull * state.data[0].ravel()]
+    least = np.r_[np.full(12, -np.inf), 0, 0]
+    exact = scipy.optimize.lsq_linear(system, right, (least, np.inf), "bvls", tol=1e-14).x
+    assert (exact[12:] > 0).tolist() == [True, False]
+    found = jax.jit(lambda state: splitting.reflected(state).data[0] + state.data[0])(state) / 2
+    np.testing.assert_allclose(np.ravel(found), exact[:12], rtol=1e-8)
+
+
+@pytest.mark.thorough
+def test_gradients_pass_through_the_data_of_other_operators():
+    """They raised an error, for what only decides how conjugate gradients begin and end."""
+    splitting, state, captures = matrices()
+
+    @jax.jit
+    def data(capture):
+        return splitting.with_captures((capture, captures[1])).reflected(state).data[0]
+
+    expected = finite_difference(data, captures[0], jnp.ones_like(captures[0]), 1e-3)
+    slope = jax.jacrev(data)(captures[0]).sum(axis=(-3, -2, -1))
+    np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=1e-9)
 
 
 SOLVERS = [

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from packaging.requirements import Requirement
 
 from thincam_jax._core.memory import available_bytes, readable
 from thincam_jax._core.precision import product
@@ -22,16 +23,16 @@ PACKAGES = (
     *("thincam_jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "scikit-image", "optimistix"),
     *("lineax", "optax", "jaxopt", "pydantic", "matplotlib"),
 )
-OPTIONAL = {
-    "pytest-benchmark": "benchmarks (make bench)",
-    "mpmath": "tests",
-    "hypothesis": "tests",
-    "dask": "sweeps on other machines (thincam sweep --scheduler)",
-    "distributed": "sweeps on other machines (thincam sweep --scheduler)",
-    "pyarrow": "sweeps (thincam sweep)",
-    "zarr": "stores of the rig and of matrices (thincam capture)",
-    "imagecodecs": "compressed TIFF, 16-bit colour PNG",
-    "rawpy": "DNG and raw files of cameras",
+# What each extra of pyproject.toml is for.
+EXTRAS = {
+    "hardware": "the rig",
+    "sweep": "sweeps",
+    "notebook": "explore",
+    "stores": "stores of captures and matrices",
+    "codecs": "compressed TIFF and 16-bit colour PNG",
+    "raw": "DNG and raw files of cameras",
+    "containers": "HDF5 and MATLAB 7.3",
+    "layout": "masks for lithography (GDS)",
 }
 
 
@@ -76,15 +77,41 @@ def machine_report() -> list[str]:
     ]
 
 
-def package_report() -> list[str]:
-    """Lines with the versions of packages, and the purpose of optional ones that are missing."""
-    needed, optional = dict.fromkeys(PACKAGES) | installed(PACKAGES), installed(OPTIONAL)
-    missing = (name for name in OPTIONAL if name not in optional)
+def verdict() -> list[str]:
+    """Lines that say what can be done here, and what to install for the rest."""
+    absent = [name for name in PACKAGES if name not in installed(PACKAGES)]
+    wrong = [f"{name} is not installed" for name in absent]
+    if (sums := compiled_sums()) != "right":
+        wrong.append(f"compiled sums are {sums}")
+    lacking = {extra: missing for extra in EXTRAS if (missing := missing_packages(extra))}
+    can = ["simulate", "reconstruct", "design", *(EXTRAS[e] for e in EXTRAS if e not in lacking)]
     return [
-        *(f"{name} {version or 'NOT INSTALLED'}" for name, version in needed.items()),
-        *(f"optional {name} {version}" for name, version in optional.items()),
-        *(f"optional {name} is missing: {OPTIONAL[name]}" for name in missing),
+        f"not ready: {'; '.join(wrong)}" if wrong else f"ready: {', '.join(can)}",
+        *(
+            f"not installed: {EXTRAS[extra]} ({', '.join(missing)}); "
+            f"pip install 'thincam-jax[{extra}]'"
+            for extra, missing in lacking.items()
+        ),
     ]
+
+
+def missing_packages(extra: str) -> list[str]:
+    """The packages of an extra that are not installed."""
+    chosen = {"extra": extra}
+    needed = [Requirement(text) for text in metadata.requires("thincam_jax") or ()]
+    needed = [r for r in needed if r.marker and not r.marker.evaluate({"extra": ""})]
+    found: list[str] = []
+    for one in needed:
+        if one.marker is not None and one.marker.evaluate(chosen):
+            inner = [name for other in one.extras for name in missing_packages(other)]
+            found += inner if one.extras else [one.name] if not installed([one.name]) else []
+    return found
+
+
+def package_report() -> list[str]:
+    """Lines with the versions of packages."""
+    versions = dict.fromkeys(PACKAGES) | installed(PACKAGES)
+    return [f"{name} {version or 'NOT INSTALLED'}" for name, version in versions.items()]
 
 
 def usable_cores() -> int:

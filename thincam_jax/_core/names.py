@@ -1,10 +1,31 @@
 """Attributes of packages: their modules, and the nearest name where one is misspelt."""
 
+import ast
 import importlib
 import importlib.util
+import pkgutil
 import sys
 from collections.abc import Callable
 from typing import Any
+
+
+def lazy_face(package: str) -> tuple[Any, Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package whose names stand in its stub, `__init__.pyi`.
+
+    Each is imported at its first use, so that a room is there before what it computes with.
+    """
+    places = {
+        alias.name: f"{'.' * node.level}{node.module or alias.name}"
+        for node in ast.parse(pkgutil.get_data(package, "__init__.pyi") or b"").body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+    def named(name: str) -> Any:
+        module = importlib.import_module(places[name], package)
+        return module if places[name] == f".{name}" else getattr(module, name)
+
+    return modules_of(package, named), lambda: sorted(places)
 
 
 def modules_of(package: str, names: Callable[[str], Any] | None = None) -> Any:

@@ -15,12 +15,11 @@ from typer.core import TyperCommand, TyperGroup
 
 from thincam_jax._core.program_cache import cache_state, keep_programs
 from thincam_jax.commands import terminal
-from thincam_jax.commands.capture.command import capture, known_drivers, preview
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.explore import explore
-from thincam_jax.commands.kinds import init, load_experiment
+from thincam_jax.commands.kinds import commands_of_rooms, has_room, init, load_experiment
 from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
-from thincam_jax.commands.run import design, run, train
+from thincam_jax.commands.run import design, run
 from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import reported, say, say_result
 
@@ -133,11 +132,9 @@ for group, command, *examples in (
         'sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
     ),
     (app, design, "design design.yaml", "design design.yaml --out found"),
-    (app, train, "train learned.yaml", "train learned.yaml --resume"),
-    (app, preview, "preview rig_virtual.yaml"),
-    (app, capture, "capture rig_virtual.yaml", "capture rig.yaml --out frames.zarr --resume"),
     (app, examine, "examine RAW.tif --psf PSF.tif", "examine CAPTURES/*.tif --json"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
+    *((app, *one) for one in commands_of_rooms()),
 ):
     layout = Grouped if command in (reconstruct, check) else Once
     printing = command if command is schema else with_output(command)  # a schema is JSON
@@ -183,12 +180,22 @@ def options(
 def doctor(
     devices: Annotated[bool, typer.Option(help="What is connected, by looking alone.")] = False,
     ask: Annotated[str | None, typer.Option(help="A serial port to ask what it is.")] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Versions, precisions and drivers, too.")
+    ] = False,
 ) -> None:
-    """Print versions, devices and what is missing."""
+    """Say what can be done here and what is missing."""
     with reported(lambda: "interrupted"):
-        from thincam_jax._core.environment import machine_report, package_report
+        from thincam_jax._core.environment import machine_report, package_report, verdict
 
-        programs = f"compiled programs: {cache_state()}"
-        hardware = known_drivers(devices, ask)
-        lines = [*machine_report(), programs, *package_report(), *hardware]
+        lines = verdict()
+        if everything:
+            programs = f"compiled programs: {cache_state()}"
+            lines += [*machine_report(), programs, *package_report()]
+        else:
+            lines.append("versions, precisions and drivers: thincam doctor --all")
+        if (everything or devices or ask) and has_room("hardware"):
+            from thincam_jax.hardware.commands.command import known_drivers
+
+            lines += known_drivers(devices, ask)
         say_result("report", lines, "\n".join(lines))

@@ -4,6 +4,7 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,12 +20,13 @@ class Kind:
     """One kind of experiment file.
 
     - `noun`: name of such a file. `command`: command of `thincam` that takes it.
-    - `section`: its configuration, as MODULE:NAME in `thincam_jax.commands`.
+    - `section`: its configuration, as MODULE:NAME in the `commands` of its room or the package.
     - `costs`: function of a configuration and its objects that gives lines about its run.
     - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
     - `build`, `run`: functions. For `thincam run`: makes objects of the configuration, and runs
       these into a folder; its result has a `table`. For `thincam train`: makes the lessons, and
       trains in a folder.
+    - `room`: the one of `ROOMS` that it belongs to, if any.
     """
 
     noun: str
@@ -34,42 +36,84 @@ class Kind:
     example: str = ""
     build: str = ""
     run: str = ""
+    room: str = ""
 
     def part(self, place: str) -> Any:
         """The object at MODULE:NAME, imported when it is needed."""
-        module, name = place.split(":")
-        return getattr(import_module(f"thincam_jax.commands.{module}"), name)
+        return _part(self.room, place)
+
+
+# Rooms that an installation may leave out, with all that is theirs, and whether commands are.
+ROOMS = {"waveguide": False, "hardware": True, "learn": True}
+
+
+def has_room(room: str) -> bool:
+    """Whether the installation has a room of the package."""
+    return (Path(__file__).parents[1] / room / "__init__.py").is_file()
+
+
+def commands_of_rooms() -> Iterator[tuple[Any, ...]]:
+    """Functions and examples of the commands that come with rooms."""
+    for room, has_commands in ROOMS.items():
+        if has_commands and has_room(room):
+            yield from _part(room, "command:COMMANDS")
+
+
+def section_of(room: str, place: str) -> Any:
+    """A section of another room's files; without the room one that is refused."""
+    if has_room(room):
+        return _part(room, place)
+    from pydantic import BeforeValidator
+
+    def refuse(_: Any) -> None:
+        raise ValueError(_needs(room))
+
+    return Annotated[None, BeforeValidator(refuse)]
+
+
+def _part(room: str, place: str) -> Any:
+    module, name = place.split(":")
+    parts = ("thincam_jax", room, "commands", module)
+    return getattr(import_module(".".join(filter(None, parts))), name)
+
+
+def _needs(room: str) -> str:
+    return f"needs thincam_jax.{room}, which this installation has not"
 
 
 # By the `kind` of their files; a study's file does not name it.
-KINDS = {
+_ALL = {
     "study": Kind(
-        *("a study", "run", "sections:StudyConfig", "explain:psfs", "quick"),
+        *("a study", "run", "sections:StudyConfig", "study.build:psfs", "quick"),
         *("study.build:build_study", "study.run:run_study"),
     ),
     "refocus": Kind(
-        *("a refocusing", "run", "refocus:RefocusConfig", "explain:psfs", "fza_refocus"),
+        *("a refocusing", "run", "refocus:RefocusConfig", "study.build:psfs", "fza_refocus"),
         *("refocus:build_refocus", "refocus:run_refocus"),
     ),
     "screen": Kind(
-        *("a see-through screen", "run", "screen.config:ScreenConfig", "explain:rays"),
-        *("sts_camera", "screen.run:build_screen", "screen.run:run_screen"),
+        *("a see-through screen", "run", "config:ScreenConfig", "run:rays"),
+        *("sts_camera", "run:build_screen", "run:run_screen", "waveguide"),
     ),
     "design": Kind(
-        *("a design", "design", "design.config:DesignConfig", "explain:search", "design_distances")
+        *("a design", "design", "design.config:DesignConfig", "design.build:search"),
+        "design_distances",
     ),
     "capture": Kind(
-        *("a capture", "capture", "capture.config:CaptureConfig", "explain:frames", "rig_virtual")
+        *("a capture", "capture", "config:CaptureConfig", "command:frames"),
+        "rig_virtual",
+        room="hardware",
     ),
     "learned": Kind(
-        *("a network", "train", "learned.refocusing:LearnedConfig", "explain:lessons"),
-        *("learned_refocus", "learned.refocusing:build_lessons", "learned.refocusing:run_training"),
+        *("a network", "train", "refocusing:LearnedConfig", "training:lessons"),
+        *("learned_refocus", "refocusing:build_lessons", "refocusing:run_training", "learn"),
     ),
     "denoiser": Kind(
-        *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "explain:lessons"),
-        *("denoiser", "learned.denoiser:build_lessons", "learned.denoiser:run_denoiser"),
+        *("a denoiser", "train", "denoiser:DenoiserConfig", "training:lessons"),
+        *("denoiser", "denoiser:build_lessons", "denoiser:run_denoiser", "learn"),
     ),
 }
+KINDS = {name: kind for name, kind in _ALL.items() if not kind.room or has_room(kind.room)}
 
 
 def kind_of(config: Any) -> Kind:
@@ -90,6 +134,8 @@ def read_kind(path: str | Path) -> Kind:
         return KINDS["study"]
     if isinstance(given, str) and given in named:
         return named[given]
+    if isinstance(given, str) and given in _ALL and given != "study":
+        raise ConfigError(f"{path}: kind: {given} {_needs(_ALL[given].room)}")
     *others, last = (f"'kind: {name}'" for name, kind in named.items() if kind.command == "run")
     raise ConfigError(
         f"{path}: kind: {given!r} is unknown; write {', '.join(others)} or {last}, or leave it out "

@@ -1,10 +1,10 @@
-"""The commands `thincam run`, `design` and `train`.
+"""The commands `thincam run` and `design`.
 
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -13,16 +13,12 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     counted,
-    progress_bar,
     reported,
     say,
     say_result,
     show,
     warn,
 )
-
-if TYPE_CHECKING:
-    from thincam_jax.learn.training import TrainingProgress
 
 
 def run(
@@ -56,7 +52,7 @@ def run(
         from thincam_jax.commands.run_folder import RunFolder
 
         if config.is_dir():
-            from thincam_jax.commands.capture.command import reconstruct_store
+            from thincam_jax.hardware.commands.command import reconstruct_store
 
             if set_ or dry_run:
                 option = "--set" if set_ else "--dry-run"
@@ -110,50 +106,3 @@ def design(
     show(found.table())
     say(found.levels())
     say_result("report", folder.path / "report.html")
-
-
-def train(
-    config: Annotated[
-        Path, typer.Argument(help="Experiment file (YAML) of kind learned or denoiser.")
-    ],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default runs/NAME of the network.")
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training that the folder holds.")
-    ] = False,
-    set_: Overrides = None,
-    dry_run: DryRun = False,
-) -> None:
-    """Train a network that refocuses the captures of a camera, or a denoiser.
-
-    Writes network.thincam, figures and training.json. Ctrl-C, or a power cut, loses what was done
-    since the last check; --resume goes on from there, to the same numbers.
-    """
-    goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
-    with reported(lambda: goes_on):
-        from thincam_jax.commands import explain
-        from thincam_jax.commands.kinds import kind_of, load_experiment
-        from thincam_jax.commands.learned.training import InFolder, TrainingFolder
-
-        asked = load_experiment(config, tuple(set_ or ()), "train")
-        kind = kind_of(asked)
-        folder = TrainingFolder.chosen(out, asked.name, asked)
-        if dry_run:
-            InFolder(folder, lambda _: None, resume).check(asked)
-            kind.part(kind.build)(asked)
-            explain.dry_run(asked, folder.outcome(asked))
-            return
-        with progress_bar("{task.fields[loss]}") as bar:
-            task = bar.add_task(asked.name, total=asked.training.steps, loss="")
-
-            def tell(progress: "TrainingProgress") -> None:
-                score = f", best {progress.score:.3f}" if progress.score == progress.score else ""
-                bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
-                bar.start()
-
-            found = kind.part(kind.run)(asked, InFolder(folder, tell, resume))
-    say(found.line)
-    if found.page is not None:
-        say_result("report", found.page)
-    say_result("network", found.network)

@@ -59,6 +59,9 @@ def reported(interrupted: Callable[[], str]) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
         mended = (ConfigError, MeasurementError, OSError, MemoryError)
+        room = (getattr(error, "name", None) or "") if isinstance(error, ImportError) else ""
+        if room.startswith("thincam_jax."):
+            error = ConfigError(f"this needs {room}, which this installation has not")
         if not isinstance(error, mended) and not _no_memory(error):
             raise
         tell(in_a_line(error))

@@ -44,6 +44,12 @@ def jpeg_bytes(pixels: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
+def as_picture(image: np.ndarray) -> np.ndarray:
+    """Picture (y, x) or (y, x, channel) of an image (channel, y, x)."""
+    picture = np.moveaxis(image, 0, -1)
+    return picture[..., 0] if picture.shape[-1] == 1 else picture
+
+
 def pictures(image: Any, *, planes: bool = False) -> list[np.ndarray]:
     """The images of (*batch, y, x), each (y, x) or, of three channels, (y, x, 3), colours last.
 

@@ -59,22 +59,12 @@ class Exposure:
     def mask(self, mask: AbstractMask | None = None) -> AbstractMask:
         """A zone plate with the numbers of this exposure and all others as of `mask`, whose own
         profile holds where the exposure has none. A mask of another family is returned as it is."""
+        numbers: dict[str, Any] = {"beta": self.beta, "phase": self.phase, "width": self.width}
+        if self.profile is not None:
+            numbers["profile"] = self.profile
         if mask is None:
-            mask = FresnelZoneAperture(1.0, width=self.width)
-        if not isinstance(mask, FresnelZoneAperture):
-            return mask
-        pixels = mask.pixels
-        return FresnelZoneAperture(
-            self.beta,
-            self.phase,
-            width=self.width,
-            height=mask.height,
-            profile=self.profile or mask.profile,
-            centre=mask.centre,
-            pixel_pitch=None if pixels is None else decimal_value(mask.width) / pixels[1],
-            fill_factor=mask.fill_factor,
-            harmonics=mask.harmonics,
-        )
+            return FresnelZoneAperture(**numbers)
+        return mask.replace(**numbers) if isinstance(mask, FresnelZoneAperture) else mask
 
     def sensor(self, sensor: Sensor) -> Sensor:
         """The sensor exposed `relative_time` times as long."""

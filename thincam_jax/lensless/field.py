@@ -23,7 +23,8 @@ from thincam_jax.lensless.masks.base import zone_orders
 from thincam_jax.lensless.method import Model, PsfMethod, as_method, has_few_terms
 from thincam_jax.lensless.propagation.obliquity import ERROR_PER_RADIAN, shift_variance
 from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes
-from thincam_jax.lensless.psf import AVERAGES, spectral_psf
+from thincam_jax.lensless.psf import spectral_psf
+from thincam_jax.lensless.resolve import AVERAGES
 
 # Points of the field along each axis: odd, so that the axis is one of them.
 _LEAST_POINTS, _MOST_POINTS = 3, 21

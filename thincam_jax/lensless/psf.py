@@ -3,7 +3,6 @@
 import functools
 import math
 import operator
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -17,7 +16,6 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers, Position
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import (
     allow,
     as_complex,
@@ -29,46 +27,28 @@ from thincam_jax._core.precision import (
     turn_phasor,
 )
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.cost import psf_cost
-from thincam_jax.lensless.digits import require_digits
-from thincam_jax.lensless.masks.base import (
-    AbstractFactoredMask,
-    AbstractMask,
-    require_factored,
-    term_count,
-)
+from thincam_jax.lensless.masks.base import AbstractMask, require_factored
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     SAMPLED,
-    AccuracyWarning,
     Model,
     PsfMethod,
     as_method,
     has_few_terms,
-    odd_from,
-    psf_method,
 )
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
-from thincam_jax.lensless.propagation.obliquity import require_off_axis
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.radial import profile_samples, radial
+from thincam_jax.lensless.propagation.radial import radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
+from thincam_jax.lensless.propagation.separable import separable
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
-from thincam_jax.lensless.propagation.skew import focuses_on_a_line, skew_image
-from thincam_jax.lensless.sampling import require_phase_sampling
-
-# Part of the tolerance over a field that averages over pixels may take.
-AVERAGES = 1 / 4
-# Operations of samples chosen by default, some ten seconds, that are warned of.
-_SLOW = 1e10
-# Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
-_IN_CELL, _UNKNOWN_CELL = 16, 7
+from thincam_jax.lensless.propagation.skew import skew_image
+from thincam_jax.lensless.resolve import resolve
 
 
 @checked
@@ -123,7 +103,9 @@ def psf(
     **See also**: `otf`, `choose_model`, `capture`.
     """
     path = camera.path(wavelength, object_distance, at)
-    return _evaluate(_psf, camera, path, as_method(model, pixel_integration))
+    return _in_precision_of(
+        camera, _psf, *resolve(camera, path, as_method(model, pixel_integration))
+    )
 
 
 def psf_about_ray(
@@ -135,7 +117,7 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
-    return _evaluate(_psf, camera, path, method)
+    return _in_precision_of(camera, _psf, *resolve(camera, path, method))
 
 
 def spectral_psf(
@@ -182,7 +164,9 @@ def otf(
     **See also**: `psf`, `lensless.phase_shift.fringe_scanned_otf`.
     """
     path = camera.path(wavelength, object_distance, at)
-    return _evaluate(_otf, camera, path, as_method(model, pixel_integration))
+    return _in_precision_of(
+        camera, _otf, *resolve(camera, path, as_method(model, pixel_integration))
+    )
 
 
 @checked
@@ -228,7 +212,7 @@ def mtf(
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
     path = camera.path(wavelength, object_distance)
-    h = _evaluate(_psf, camera, path, as_method(model, pixel_integration))
+    h = _in_precision_of(camera, _psf, *resolve(camera, path, as_method(model, pixel_integration)))
     return _contrast(h, grid, rho)
 
 
@@ -306,68 +290,12 @@ def _otf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def sampled_off_axis(
-    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
-) -> PsfMethod:
-    """The method; in place of "separable" samples where a mask of edges has no closed form.
-
-    That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
-    zones that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
-    edge's wave, leave about 1 %.
-    """
-    if method.model != "separable" or path.at is None:
-        return method
-    cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
-    beyond = path.skew and (cells or focuses_on_a_line(mask, path))
-    if not (beyond or mask.exact_model == "radial"):
-        return method
-    samples = _UNKNOWN_CELL
-    if not checks.holds_traced(mask, grid, replace(path, at=None)):
-        with jax.ensure_compile_time_eval():  # they are known under jit, too
-            zone = math.sqrt(path.wavelength * path.distance / path.magnification)
-            finest = mask.finest_frequency
-            cell = zone if finest is None else 0.5 / float(finest)
-            samples = odd_from(_IN_CELL * float(grid.pitch) / math.sqrt(cell * zone))
-    return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
-
-
-def _evaluate(function, camera: LenslessCamera, path: LightPath, method: PsfMethod):
-    """Value of a function in the method's precision, returned in the camera's."""
-    mask, grid = camera.mask, camera.sensor.grid
-    tolerance = AVERAGES * (method.field_tolerance or 0.0)
-    given, own = method, precision_of(grid.pitch)
-    method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
-    require_phase_sampling(mask, grid, path, method)
-    require_off_axis(mask, path, method.model)
-    averaged = method.pixel_integration and method.nodes is None
-    if method.model == "separable" and averaged:
-        nodes = pixel_nodes(mask, grid, path, method.float_type, tolerance)
-        method = replace(method, nodes=nodes)
-    if method.model == "radial" and method.oversampling is None:
-        method = replace(method, oversampling=profile_samples(mask, grid, path, method))
-    with allow(method.float_type, mask, grid, path):
-        if method.precision != own:
-            mask, grid, path = cast((mask, grid, path), method.float_type)
-        if method.precision == "float32":
-            require_digits(mask, grid, path, method.model)
-        (rows, columns), cost = grid.shape, psf_cost(mask, grid, method)
-        refuse_if_too_large(
-            f"a PSF of {rows}×{columns} pixels by model {method.model!r}",
-            cost.bytes,
-            "use a smaller grid"
-            if method.model not in SAMPLED
-            else "use a smaller grid or less oversampling",
-        )
-        if given.model != method.model == "angular_spectrum" and cost.flops > _SLOW:
-            few = odd_from(method.samples / 3)
-            warnings.warn(
-                f"off the axis {method.samples}×{method.samples} samples a pixel hold this "
-                f"{type(mask).__name__}, some {10 * cost.flops / _SLOW:.0f} s of a core; "
-                f"PsfMethod('angular_spectrum', oversampling={few}) takes a tenth, and is coarser",
-                AccuracyWarning,
-                stacklevel=4,
-            )
-        result = function(mask, grid, path, method)
+def _in_precision_of(camera: LenslessCamera, function, *resolved):
+    """Value of a function of what `resolve` gives, in the camera's precision."""
+    *numbers, method = resolved
+    with allow(method.float_type, *numbers):
+        result = function(*resolved)
+    own = precision_of(camera.sensor.pitch)
     return result if method.precision == own else cast(result, own)
 
 

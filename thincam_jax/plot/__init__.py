@@ -4,7 +4,7 @@ Each function draws a figure of pyplot and returns it. A notebook shows it once,
 with `matplotlib.pyplot.show()` and keeps it with `figure.savefig("psf.png")`.
 
 What reports show of a study, a refocusing, a screen, a rig, a sweep or a training is in the modules
-of these names, such as `thincam_jax.plot.screen`; results draw their main figure by `plot()`.
+of these names, such as `thincam_jax.waveguide.plot`; results draw their main figure by `plot()`.
 """
 
 from thincam_jax._core.names import modules_of

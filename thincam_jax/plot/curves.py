@@ -1,6 +1,6 @@
 """Figures of numbers: a solver's history, objectives, fronts of designs and their tolerances."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +12,15 @@ from thincam_jax.reconstruction.result import Reconstruction
 
 # The figures of reconstructions wait for no design.
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from thincam_jax.design.design import Design
     from thincam_jax.design.fronts import FrontPoint
+    from thincam_jax.design.landscape import Landscape
     from thincam_jax.design.sensitivity import Sensitivity
+
+_ROOM = 0.06  # around points, as a part of an axis
+_SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
 
 
 @checked
@@ -74,6 +81,79 @@ def landscape(
     axes.plot(across[column], down[row], "x", color="tab:red", markersize=9)
     axes.set(xlabel=labels[0], ylabel=labels[1])
     return figure
+
+
+def draw_landscape(
+    landscape: "Landscape", ax: "Axes", designs: "Mapping[str, Design]", costs: Mapping[str, float]
+) -> None:
+    """A map of two numbers, or a line over one; arguments as of `Landscape.plot`."""
+    from thincam_jax.design.space import REPORTED
+
+    scaled = zip(landscape.variables, landscape.axes, strict=True)
+    axes = [axis * REPORTED[name].scale for (name, _), axis in scaled]
+    labels = [REPORTED[name].of_shots(shots) for name, shots in landscape.variables]
+    places = {name: landscape.place(design) for name, design in designs.items()}
+    if len(axes) == 1:
+        _draw_line(ax, landscape, axes[0], places, costs)
+        ax.set(xlabel=labels[0], ylabel=landscape.label)
+    else:
+        _draw_map(ax, landscape, axes, places)
+        ax.set(xlabel=labels[0], ylabel=labels[1])
+    if places:
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.1)}
+        ax.legend(fontsize=9, ncols=2, frameon=False, **below)
+
+
+def _draw_line(
+    ax: "Axes",
+    landscape: "Landscape",
+    axis: np.ndarray,
+    places: Mapping[str, Any],
+    costs: Mapping[str, float],
+) -> None:
+    ax.plot(axis, landscape.values, color="black", linewidth=1)
+    for number, (name, (place,)) in enumerate(places.items()):
+        on_line = np.interp(place, axis, landscape.values)
+        height = landscape.reported(costs[name]) if name in costs else on_line
+        ax.plot(place, float(height), label=name, zorder=5, **_marker(number))
+    ax.grid(alpha=0.3)
+
+
+def _draw_map(
+    ax: "Axes", landscape: "Landscape", axes: list[np.ndarray], places: Mapping[str, Any]
+) -> None:
+    values = landscape.values.T
+    more = getattr(landscape.objective, "maximised", False)
+    worst = np.nanpercentile(values, 100 - _SHADED if more else _SHADED)
+    shades: dict[str, Any] = {"vmin" if more else "vmax": worst, "cmap": "cividis"}
+    x, y = axes
+    shown = ax.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
+    figure: Any = ax.figure
+    figure.colorbar(shown, ax=ax, label=landscape.label, extend="min" if more else "max")
+    # Grounds beside the map are not allowed, or not looked at.
+    ax.set_facecolor("#e8e8e8")
+    own = np.array([*places.values()]).reshape(-1, 2)
+    ax.set_xlim(*_reach(x, own[:, 0]))
+    ax.set_ylim(*_reach(y, own[:, 1]))
+    for number, (name, place) in enumerate(places.items()):
+        ax.plot(*place, label=name, clip_on=False, zorder=5, **_marker(number))
+
+
+def _marker(number: int) -> dict[str, Any]:
+    """Marker of the reference, number 0, and of designs found: told apart by shape."""
+    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
+    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
+    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
+
+
+def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+    """The axis, and room for points that lie beyond it."""
+    half = (axis[1] - axis[0]) / 2
+    low, high = axis[0] - half, axis[-1] + half
+    room = _ROOM * (high - low)
+    low = min([low, *(own - room)[own < low]])
+    high = max([high, *(own + room)[own > high]])
+    return float(low), float(high)
 
 
 def front(points: "Sequence[FrontPoint]", cost: str) -> Figure:

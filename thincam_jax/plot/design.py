@@ -1,7 +1,7 @@
 """The figures of a design: the objective's landscape, responses, contrast transfer and fronts."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,16 +10,18 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.design.design import Design, Shot
-from thincam_jax.design.landscape import Landscape
-from thincam_jax.design.ranking import RankedDesign
-from thincam_jax.design.space import REPORTED
 from thincam_jax.design.training_search import TrainingError
-from thincam_jax.design.transfer import ModulationTransfer
+from thincam_jax.plot.curves import draw_landscape
 from thincam_jax.plot.frame import drawing, line_style
-from thincam_jax.studies.design import FoundDesigns
-from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores
-from thincam_jax.studies.study import Study
+
+if TYPE_CHECKING:
+    from thincam_jax.design.design import Shot
+    from thincam_jax.design.landscape import Landscape
+    from thincam_jax.design.ranking import RankedDesign
+    from thincam_jax.design.transfer import ModulationTransfer
+    from thincam_jax.studies.design import FoundDesigns
+    from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores
+    from thincam_jax.studies.study import Study
 
 _LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
@@ -35,12 +37,10 @@ _LABELS = {
     "captures": "captures",
     "light": "light: electrons from each mm² of open aperture",
 }
-_ROOM = 0.06  # around points, as a part of an axis
-_SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
 _MASK_SAMPLES = 600  # along a side of a drawn mask
 
 
-def draw_masks(study: Study, best: str) -> Figure:
+def draw_masks(study: "Study", best: str) -> Figure:
     """The first mask of each shot and its PSF, of the reference and of the best design, in rows."""
     methods = [study.methods[0], next(m for m in study.methods if m.name == best)]
     shots = max(len(method.shots) for method in methods)
@@ -64,78 +64,9 @@ def draw_masks(study: Study, best: str) -> Figure:
     return figure
 
 
-def draw_landscape(
-    landscape: Landscape, ax: Axes, designs: Mapping[str, Design], costs: Mapping[str, float]
-) -> None:
-    """A map of two numbers, or a line over one; arguments as of `Landscape.plot`."""
-    scaled = zip(landscape.variables, landscape.axes, strict=True)
-    axes = [axis * REPORTED[name].scale for (name, _), axis in scaled]
-    labels = [REPORTED[name].of_shots(shots) for name, shots in landscape.variables]
-    places = {name: landscape.place(design) for name, design in designs.items()}
-    if len(axes) == 1:
-        _draw_line(ax, landscape, axes[0], places, costs)
-        ax.set(xlabel=labels[0], ylabel=landscape.label)
-    else:
-        _draw_map(ax, landscape, axes, places)
-        ax.set(xlabel=labels[0], ylabel=labels[1])
-    if places:
-        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.1)}
-        ax.legend(fontsize=9, ncols=2, frameon=False, **below)
-
-
-def _draw_line(
-    ax: Axes,
-    landscape: Landscape,
-    axis: np.ndarray,
-    places: Mapping[str, Any],
-    costs: Mapping[str, float],
-) -> None:
-    ax.plot(axis, landscape.values, color="black", linewidth=1)
-    for number, (name, (place,)) in enumerate(places.items()):
-        on_line = np.interp(place, axis, landscape.values)
-        height = landscape.reported(costs[name]) if name in costs else on_line
-        ax.plot(place, float(height), label=name, zorder=5, **_marker(number))
-    ax.grid(alpha=0.3)
-
-
-def _draw_map(
-    ax: Axes, landscape: Landscape, axes: list[np.ndarray], places: Mapping[str, Any]
-) -> None:
-    values = landscape.values.T
-    more = getattr(landscape.objective, "maximised", False)
-    worst = np.nanpercentile(values, 100 - _SHADED if more else _SHADED)
-    shades: dict[str, Any] = {"vmin" if more else "vmax": worst, "cmap": "cividis"}
-    x, y = axes
-    shown = ax.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
-    figure: Any = ax.figure
-    figure.colorbar(shown, ax=ax, label=landscape.label, extend="min" if more else "max")
-    # Grounds beside the map are not allowed, or not looked at.
-    ax.set_facecolor("#e8e8e8")
-    own = np.array([*places.values()]).reshape(-1, 2)
-    ax.set_xlim(*_reach(x, own[:, 0]))
-    ax.set_ylim(*_reach(y, own[:, 1]))
-    for number, (name, place) in enumerate(places.items()):
-        ax.plot(*place, label=name, clip_on=False, zorder=5, **_marker(number))
-
-
-def _marker(number: int) -> dict[str, Any]:
-    """Marker of the reference, number 0, and of designs found: told apart by shape."""
-    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
-    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
-    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
-
-
-def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
-    """The axis, and room for points that lie beyond it."""
-    half = (axis[1] - axis[0]) / 2
-    low, high = axis[0] - half, axis[-1] + half
-    room = _ROOM * (high - low)
-    low = min([low, *(own - room)[own < low]])
-    high = max([high, *(own + room)[own > high]])
-    return float(low), float(high)
-
-
-def draw_objective(result: FoundDesigns, count: int, figure: Figure | None = None) -> Figure | None:
+def draw_objective(
+    result: "FoundDesigns", count: int, figure: Figure | None = None
+) -> Figure | None:
     """The objective over the free numbers, with the reference and the first `count` found.
 
     None where the search's bounds leave no room to draw.
@@ -145,7 +76,7 @@ def draw_objective(result: FoundDesigns, count: int, figure: Figure | None = Non
     return _marked(result.landscape, result.objective.unit, costs, figure)
 
 
-def draw_training(result: FoundDesigns, count: int) -> Figure | None:
+def draw_training(result: "FoundDesigns", count: int) -> Figure | None:
     """The training error over the free numbers, with designs; None without training."""
     if result.training is None:
         return None
@@ -155,9 +86,9 @@ def draw_training(result: FoundDesigns, count: int) -> Figure | None:
 
 
 def _marked(
-    landscape: Landscape | None,
+    landscape: "Landscape | None",
     unit: str,
-    costs: list[tuple[RankedDesign, float, float]],
+    costs: "list[tuple[RankedDesign, float, float]]",
     figure: Figure | None = None,
 ) -> Figure | None:
     """Figure with designs, each with the cost where it is drawn, and that of the legend."""
@@ -171,7 +102,7 @@ def _marked(
     return drawn_on
 
 
-def draw_responses(result: FoundDesigns, count: int, pitch: float) -> Figure:
+def draw_responses(result: "FoundDesigns", count: int, pitch: float) -> Figure:
     """Ring means of the signal-to-noise ratio of the reference and the first `count` found."""
     figure = Figure(figsize=(8.5, 6.2), layout="constrained")
     ax, over = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1))
@@ -200,7 +131,7 @@ def draw_responses(result: FoundDesigns, count: int, pitch: float) -> Figure:
     return figure
 
 
-def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
+def draw_mtf(result: "FoundDesigns", object_distance: float) -> Figure | None:
     """Contrast transfer of the reference and of the best design side by side, on common axes.
 
     `object_distance` in mm. None for a result without transfers.
@@ -218,7 +149,9 @@ def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
     return figure
 
 
-def _draw_transfer(ax: Axes, one: RankedDesign, transfer: ModulationTransfer, edge: float) -> None:
+def _draw_transfer(
+    ax: Axes, one: "RankedDesign", transfer: "ModulationTransfer", edge: float
+) -> None:
     frequency = (np.arange(len(transfer.chain)) + 0.5) / len(transfer.chain) * edge
     chain = {"color": "black", "linewidth": 2.2, "label": "camera and reconstruction"}
     ax.plot(frequency, transfer.chain, **chain)
@@ -233,7 +166,7 @@ def _draw_transfer(ax: Axes, one: RankedDesign, transfer: ModulationTransfer, ed
     ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
 
 
-def _sum_label(shot: Shot, sums: tuple[tuple[int, ...], tuple[int, ...]]) -> str:
+def _sum_label(shot: "Shot", sums: tuple[tuple[int, ...], tuple[int, ...]]) -> str:
     """Label of a sum of captures: "captures 1 − 2: β 25 rad/mm² at 6.5 mm"."""
     added, taken = (" + ".join(str(n) for n in part) for part in sums)
     formula = f"{added} − {taken.replace('+', '−')}" if taken else added
@@ -251,7 +184,7 @@ def _decibel(level: np.ndarray) -> np.ndarray:
 
 
 def draw_fronts(
-    scores: FrontsScores, reference: str, object_distance: float, figure: Figure | None = None
+    scores: "FrontsScores", reference: str, object_distance: float, figure: Figure | None = None
 ) -> Figure:
     """A panel for each front; `object_distance` in mm, `reference`: name of the design to beat."""
     count = len(scores.fronts)
@@ -273,7 +206,7 @@ def draw_fronts(
     return drawn
 
 
-def _draw_resolution(ax: Axes, front: FrontScores, reference: str) -> None:
+def _draw_resolution(ax: Axes, front: "FrontScores", reference: str) -> None:
     value, points = "resolution_cycles_per_rad", front.points
     _steps(ax, points, value, "dominated", "-")
     groups = [
@@ -290,7 +223,7 @@ def _draw_resolution(ax: Axes, front: FrontScores, reference: str) -> None:
     ax.set_ylabel("limit of resolution (cycles/rad)")
 
 
-def _draw_captures(ax: Axes, front: FrontScores, reference: str) -> None:
+def _draw_captures(ax: Axes, front: "FrontScores", reference: str) -> None:
     points = front.points
     known = [p for p in points if p.simulated_mean_db is not None]
     lines = [
@@ -309,19 +242,19 @@ def _draw_captures(ax: Axes, front: FrontScores, reference: str) -> None:
     ax.set_ylabel("PSNR, mean over the pictures (dB)")
 
 
-def _marks(ax: Axes, points: Sequence[PointScores], value: str, label: str, **style: Any) -> None:
+def _marks(ax: Axes, points: "Sequence[PointScores]", value: str, label: str, **style: Any) -> None:
     if points:
         places = ([p.cost for p in points], [getattr(p, value) for p in points])
         ax.plot(*places, label=label, markeredgecolor="black", **(_MARKER | style))
 
 
-def _mark_reference(ax: Axes, point: PointScores, value: str, name: str) -> None:
+def _mark_reference(ax: Axes, point: "PointScores", value: str, name: str) -> None:
     style = _MARKER | {"marker": "X", "markersize": 11, "zorder": 5}
     style |= {"color": "#606060", "markeredgecolor": "white"}
     ax.plot(point.cost, getattr(point, value), label=name, **style)
 
 
-def _steps(ax: Axes, points: Sequence[PointScores], value: str, flag: str, dash: str) -> None:
+def _steps(ax: Axes, points: "Sequence[PointScores]", value: str, flag: str, dash: str) -> None:
     """Draw the best value reached up to each cost."""
     front = sorted((p.cost, getattr(p, value)) for p in points if not getattr(p, flag))
     if not front:

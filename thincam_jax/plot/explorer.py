@@ -30,8 +30,9 @@ from thincam_jax.lensless.accuracy.select import choose_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import PsfMethod, has_few_terms
+from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod, has_few_terms
 from thincam_jax.lensless.phase_shift import fringe_scanned_otf, with_phase, without_carrier
+from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.methods import reconstruct
@@ -125,8 +126,13 @@ class Explorer:
             "object_distance": float(checks.positive("object_distance", object_distance, "mm")),
         }
         self.controls = (*_controls_of(camera), *_controls_of_light(**light), _TOLERANCE)
+        nodes = None
+        if has_few_terms(camera.mask):  # counted for the camera given: known numbers decide
+            path = camera.path(**light)
+            counted = pixel_nodes(camera.mask, camera.sensor.grid, path, "float64")
+            nodes = max(PIXEL_NODES, counted)
         # The camera is known, not traced: so is then that the point lies on an axis of the mask.
-        self._moving = jax.jit(functools.partial(_moving, camera))
+        self._moving = jax.jit(functools.partial(_moving, camera, PsfMethod(nodes=nodes)))
         self.values = {control.name: control.value for control in self.controls}
 
     @property
@@ -151,9 +157,12 @@ class Explorer:
 
     def view(self, *, rest: bool = True) -> View:
         """The pictures of the setting; those that take long only at rest."""
-        like = self._first.distance.dtype
-        traced = {name: jnp.asarray(value, like) for name, value in self._numbers().items()}
-        levels, profile = jax.device_get(self._moving(traced))
+        like, numbers = self._first.distance.dtype, self._numbers()
+        if rest:
+            drawn = _moving(self._first, PsfMethod(), numbers)
+        else:
+            drawn = self._moving({name: jnp.asarray(n, like) for name, n in numbers.items()})
+        levels, profile = jax.device_get(drawn)
         step = 1 / (self._first.sensor.shape[1] * float(self._first.sensor.pitch))
         frequency = np.arange(1, profile.size) * step
         magnitude = np.abs(profile[1:])
@@ -276,11 +285,11 @@ def _point(numbers: dict[str, Any]) -> tuple[float, Any]:
     return 0.0, numbers["object_distance"] * tangent
 
 
-def _moving(camera: LenslessCamera, numbers: dict[str, Any]) -> tuple[Any, Any]:
+def _moving(camera: LenslessCamera, method: PsfMethod, numbers: dict[str, Any]) -> tuple[Any, Any]:
     """The PSF as 256 grey levels, and the OTF along u ≥ 0 at v = 0."""
     light: dict[str, Any] = {name: numbers[name] for name in ("wavelength", "object_distance")}
     camera, at = _with_numbers(camera, numbers), _point(numbers) if "angle" in numbers else None
-    h = psfs.psf_about_ray(camera, **light, at=at, method=PsfMethod())
+    h = psfs.psf_about_ray(camera, **light, at=at, method=method)
     largest = jnp.max(h)
     levels = jnp.round(255 * h / jnp.where(largest > 0, largest, 1)).astype(jnp.uint8)
     # The spectrum along u is that of the sum over y; its phase about the middle pixel.

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from itertools import cycle
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.figure
 import numpy as np
@@ -13,7 +13,9 @@ from thincam_jax.imaging.display import eight_bit, pictures
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.plot.frame import Figure, new_figure, sheet, show_image
-from thincam_jax.reconstruction.result import Reconstruction
+
+if TYPE_CHECKING:
+    from thincam_jax.reconstruction.result import Reconstruction
 
 _BESIDE, _MOST = 4, 16  # images in a row, and in all, that a result shows of itself
 
@@ -84,7 +86,7 @@ def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
     return figure
 
 
-def draw_result(result: Reconstruction) -> matplotlib.figure.Figure:
+def draw_result(result: "Reconstruction") -> matplotlib.figure.Figure:
     """A reconstruction on axes in mm on the object, or in pixels where its pitch is unknown.
 
     Of a batch and of planes the first images, beside each other and with one white.

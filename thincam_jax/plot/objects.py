@@ -1,21 +1,24 @@
 """Pictures that a notebook shows of objects: a scene, a camera, a recording."""
 
+from typing import TYPE_CHECKING
+
 import matplotlib.figure
 import numpy as np
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.display import eight_bit, pictures
-from thincam_jax.imaging.scene import Scene
-from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.plot.frame import drawing, show_image
-from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
-from thincam_jax.reconstruction.recording import Recording
+
+if TYPE_CHECKING:
+    from thincam_jax.imaging.scene import Scene
+    from thincam_jax.lensless.camera import LenslessCamera
+    from thincam_jax.reconstruction.recording import Recording
 
 _MOST, _SAMPLES = 4, 256  # pictures beside each other; samples along the longer side of a mask
 _LIGHT = 550e-6  # mm, in which a phase mask is shown
 
 
-def draw_scene(scene: Scene) -> matplotlib.figure.Figure:
+def draw_scene(scene: "Scene") -> matplotlib.figure.Figure:
     """The first planes of a scene on axes in mm, with one white, titled by their distances."""
     planes = scene.planes[:_MOST]
     figure, panels = drawing((3.4 * len(planes), 3.2), 1, len(planes), squeeze=False)
@@ -26,7 +29,7 @@ def draw_scene(scene: Scene) -> matplotlib.figure.Figure:
     return figure
 
 
-def draw_camera(camera: LenslessCamera) -> matplotlib.figure.Figure:
+def draw_camera(camera: "LenslessCamera") -> matplotlib.figure.Figure:
     """A camera's mask, and mask and sensor from the side, to one scale in mm."""
     figure, (left, right) = drawing((7.2, 3.2), 1, 2)
     height, width = (float(side) for side in camera.mask.extent)
@@ -47,26 +50,17 @@ def draw_camera(camera: LenslessCamera) -> matplotlib.figure.Figure:
     return figure
 
 
-def draw_recording(recording: Recording) -> matplotlib.figure.Figure:
+def draw_recording(recording: "Recording") -> matplotlib.figure.Figure:
     """The first captures of a recording, and the PSF of the first, each to its own white."""
-    model, shown = recording.imaging_model, []
-    pitch = float(model.cameras[0].sensor.pitch) if isinstance(model, Cameras) else None
-    count = len(recording.captures)
+    shown, count = [], len(recording.captures)
+    pitch, psf = recording.pixel_pitch_and_psf()
     for number, capture in enumerate(recording.captures[: _MOST - 1]):
         title = "capture" if count == 1 else f"capture {number + 1} of {count}"
         shown.append((title, capture))
-    if isinstance(model, Psfs):
-        shown.append(("PSF", np.asarray(model.psfs)[0].reshape(-1, *model.psfs.shape[-2:])[0]))
-    elif isinstance(model, Cameras) and not model.over_field and _is_lit(model):
-        nearest = np.atleast_1d(np.asarray(model.object_distance, dtype=object))[0]
-        shown.append(("PSF", model.own_psf(0, model.cameras[0].sensor.shape, nearest)))
+    if psf is not None:
+        shown.append(("PSF", psf))
     figure, panels = drawing((3.2 * len(shown), 3.2), 1, len(shown), squeeze=False)
     for axes, (title, image) in zip(panels[0], shown, strict=True):
         show_image(axes, eight_bit(pictures(image)[0]), pitch, vmin=0, vmax=255)
         axes.set_title(title, fontsize=9)
     return figure
-
-
-def _is_lit(model: Cameras) -> bool:
-    """Whether light and distance are known, which fringe scanning does not need."""
-    return model.wavelength is not None and model.object_distance is not None

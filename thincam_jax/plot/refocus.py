@@ -3,6 +3,7 @@
 import io
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import PIL.Image
@@ -13,10 +14,12 @@ from matplotlib.patches import Rectangle
 
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.plot.frame import drawing, grey_levels, line_style, sheet, white_level
-from thincam_jax.reconstruction.depth.find import DepthMap
-from thincam_jax.reconstruction.depth.refocus import RefocusSweep
-from thincam_jax.studies.refocus import PlacedTarget, RefocusResult
-from thincam_jax.studies.study import Method
+
+if TYPE_CHECKING:
+    from thincam_jax.reconstruction.depth.find import DepthMap
+    from thincam_jax.reconstruction.depth.refocus import RefocusSweep
+    from thincam_jax.studies.refocus import PlacedTarget, RefocusResult
+    from thincam_jax.studies.study import Method
 
 _SHOWN = 15  # images on the contact sheet, in rows of five
 _HELD = 160  # ms of an image of the animation
@@ -28,7 +31,7 @@ _MEASURED = {
 }
 
 
-def draw_sweep(sweep: RefocusSweep, places: Mapping[str, float] = MappingProxyType({})) -> Figure:
+def draw_sweep(sweep: "RefocusSweep", places: Mapping[str, float] = MappingProxyType({})) -> Figure:
     """Contact sheet of the sweep, each image with the distance it is focused on.
 
     `places`: distances of objects, mm, whose nearest images are titled in bold.
@@ -57,7 +60,7 @@ def _spread(count: int, most: int, wanted: list[int]) -> list[int]:
     return sorted(picked)
 
 
-def animate_sweep(sweep: RefocusSweep) -> bytes:
+def animate_sweep(sweep: "RefocusSweep") -> bytes:
     """The sweep there and back as an animated WebP, the distance written below."""
     images, distances = np.asarray(sweep.images), np.asarray(sweep.distances)
     white = white_level(images)
@@ -87,7 +90,7 @@ def _frame(image: np.ndarray, distance: float) -> PIL.Image.Image:
     return frame
 
 
-def draw_curves(result: RefocusResult) -> Figure:
+def draw_curves(result: "RefocusResult") -> Figure:
     """Focus measure of each object over the sweep, with where it stands and where it was found."""
     figure, ax = drawing((8.5, 4.0))
     distances = np.asarray(result.sweep.distances)
@@ -107,7 +110,7 @@ def draw_curves(result: RefocusResult) -> Figure:
     return figure
 
 
-def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figure:
+def draw_depth(sweep: "RefocusSweep", depth: "DepthMap", sharp: np.ndarray) -> Figure:
     """Depth map, its confidence, and the picture that is sharp everywhere.
 
     Over directions; over pixels where measured PSFs do not tell these.
@@ -136,7 +139,7 @@ def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figur
     return figure
 
 
-def draw_methods(result: RefocusResult, figure: Figure | None = None) -> Figure:
+def draw_methods(result: "RefocusResult", figure: Figure | None = None) -> Figure:
     """Every method focused on every object; below each, the objects enlarged."""
     methods, objects = result.refocusing.study.methods, result.refocusing.objects
     aspect = max(p.shape[0] / p.shape[1] for p in result.images.values())
@@ -163,7 +166,7 @@ def draw_methods(result: RefocusResult, figure: Figure | None = None) -> Figure:
     return figure
 
 
-def _frame_objects(ax, result: RefocusResult, method: Method, focused: PlacedTarget) -> None:
+def _frame_objects(ax, result: "RefocusResult", method: "Method", focused: "PlacedTarget") -> None:
     """The object in focus in a solid box, the others in dashed ones."""
     ax.set(xticks=[], yticks=[])
     for placed in result.refocusing.objects:
@@ -176,7 +179,7 @@ def _frame_objects(ax, result: RefocusResult, method: Method, focused: PlacedTar
         ax.add_patch(frame)
 
 
-def _show_details(ax, result: RefocusResult, method: Method, focused: PlacedTarget) -> None:
+def _show_details(ax, result: "RefocusResult", method: "Method", focused: "PlacedTarget") -> None:
     """The middle of each object, enlarged, side by side; a frame round that in focus."""
     image, objects = result.images[method.name, focused.distance], result.refocusing.objects
     white = white_level(image)

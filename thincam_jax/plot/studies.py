@@ -2,25 +2,28 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from thincam_jax.imaging.display import as_picture
 from thincam_jax.imaging.metrics.mtf import low_frequency_value
 from thincam_jax.imaging.targets import middle_square
-from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot.cameras import draw_psf as draw_camera_psf
 from thincam_jax.plot.frame import drawing, line_style, sheet
-from thincam_jax.studies.evaluate import Contrasts, Evaluation, as_picture
-from thincam_jax.studies.response import Response
-from thincam_jax.studies.simulate import Capture
-from thincam_jax.studies.study import Study, Target
+
+if TYPE_CHECKING:
+    from thincam_jax.lensless.exposures import Exposure
+    from thincam_jax.studies.evaluate import Contrasts, Evaluation
+    from thincam_jax.studies.response import Response
+    from thincam_jax.studies.simulate import Capture
+    from thincam_jax.studies.study import Study, Target
 
 
 def draw_target(
-    study: Study, target: Target, capture: np.ndarray, evaluations: Mapping[str, Evaluation]
+    study: "Study", target: "Target", capture: np.ndarray, evaluations: "Mapping[str, Evaluation]"
 ) -> Figure:
     """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
     figure, whole, detail = draw_found(target, evaluations, with_capture=True)
@@ -30,14 +33,14 @@ def draw_target(
     return figure
 
 
-def truth_of(evaluations: Mapping[str, Evaluation]) -> np.ndarray:
+def truth_of(evaluations: "Mapping[str, Evaluation]") -> np.ndarray:
     """The scene on the pixels of the last method."""
     return list(evaluations.values())[-1].truth
 
 
 def draw_found(
-    target: Target,
-    evaluations: Mapping[str, Evaluation],
+    target: "Target",
+    evaluations: "Mapping[str, Evaluation]",
     *,
     with_capture: bool = False,
     figure: Figure | None = None,
@@ -63,7 +66,7 @@ def draw_found(
     return drawn, wholes[0], details[0]
 
 
-def draw_captures(study: Study, captures: Mapping[Exposure, Capture]) -> Figure:
+def draw_captures(study: "Study", captures: "Mapping[Exposure, Capture]") -> Figure:
     """All captures of a target, each from black to its own maximum."""
     aspect = study.sensor.shape[0] / study.sensor.shape[1]
     figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.9)
@@ -99,7 +102,7 @@ def _show(ax, image: np.ndarray, title: str) -> None:
         ax.set_title(title, fontsize=9)
 
 
-def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
+def _show_detail_of_capture(ax, raw: np.ndarray, study: "Study") -> None:
     detail = _middle(raw)
     low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
     _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
@@ -112,7 +115,7 @@ def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
 _FINE = (-2.5 / 32, 2.25 / 32, 8 / 32)
 
 
-def enlarged_part(image: np.ndarray, target: Target) -> tuple[np.ndarray, str]:
+def enlarged_part(image: np.ndarray, target: "Target") -> tuple[np.ndarray, str]:
     """The part of a picture that is enlarged, and what it is."""
     if target.kind != "usaf1951":
         return _middle(image), f"middle {target.width / 3:.0f} mm"
@@ -133,7 +136,7 @@ def _middle(image: np.ndarray) -> np.ndarray:
 
 
 def draw_responses(
-    study: Study, responses: Mapping[str, Response], figure: Figure | None = None
+    study: "Study", responses: "Mapping[str, Response]", figure: Figure | None = None
 ) -> Figure:
     """Transfer functions of all methods, from 0 to 1; methods of one synthesis share a panel.
 
@@ -171,7 +174,9 @@ def draw_responses(
     return drawn
 
 
-def _by_synthesis(study: Study, responses: Mapping[str, Response]) -> list[tuple[str, Response]]:
+def _by_synthesis(
+    study: "Study", responses: "Mapping[str, Response]"
+) -> "list[tuple[str, Response]]":
     """Titles and responses: the methods that take the same captures and sums of them as one."""
     names: dict[tuple, list[str]] = {}
     for method in study.methods:
@@ -180,7 +185,7 @@ def _by_synthesis(study: Study, responses: Mapping[str, Response]) -> list[tuple
     return [("; ".join(group), responses[group[0]]) for group in names.values()]
 
 
-def draw_contrasts(contrasts: Mapping[str, Contrasts]) -> Figure:
+def draw_contrasts(contrasts: "Mapping[str, Contrasts]") -> Figure:
     """Contrast of every chart element against its period, for each method."""
     figure, ax = drawing((8.5, 4.2))
     for index, (name, records) in enumerate(contrasts.items()):
@@ -200,7 +205,7 @@ def draw_contrasts(contrasts: Mapping[str, Contrasts]) -> Figure:
     return figure
 
 
-def draw_psf(study: Study) -> Figure:
+def draw_psf(study: "Study") -> Figure:
     """PSF of the first exposure: the image, and a line through its middle."""
     exposure = study.exposures[0]
     figure, title = Figure(figsize=(8.5, 3.4), layout="constrained"), study.mask_of(exposure)

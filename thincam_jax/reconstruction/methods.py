@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 import sys
 import time
 from typing import ClassVar
@@ -48,11 +47,7 @@ from thincam_jax.reconstruction.solver import (
 )
 from thincam_jax.reconstruction.splittings import admm_method
 from thincam_jax.reconstruction.total_variation import TotalVariation
-from thincam_jax.reconstruction.uniform_light import (
-    objective_with_uniform_light,
-    with_uniform_light,
-    without_uniform_light,
-)
+from thincam_jax.reconstruction.uniform_light import begin_without
 from thincam_jax.reconstruction.wiener import Wiener, filter_suffices
 
 # Iterations during which penalties adapt. Later changes make the objective jump: on the captures of
@@ -357,7 +352,10 @@ class AdmmTV(AbstractRegularised):
     def _from_nothing(self, problem, image, callback) -> Outcome:
         """Outcome from a uniform or black image; a biased camera's begins without uniform light."""
         lit = bool(np.any(np.asarray(image)))
-        first = self._without_uniform_light(problem, image, callback) if lit else None
+        # Whole chunks between two checks: a callback sees every tenth iteration throughout.
+        count = CHUNK * round(_FIRST_PART * self.iterations / CHUNK)
+        begin = Schedule(count, self.tolerance, adapt_until=min(_BALANCED, count // 2))
+        first = begin_without(problem, image, begin, callback) if lit and count else None
         if first is None:
             return self._by_admm(problem, image, callback)
         if first.status in ("stopped", "interrupted", "non_finite"):
@@ -388,24 +386,6 @@ class AdmmTV(AbstractRegularised):
         method = in_parallel(problem, admm_method)
         method = method if coarse is None else method.like(coarse)
         return iterate(method, image, schedule, callback=callback)
-
-    def _without_uniform_light(self, problem, image, callback) -> Outcome | None:
-        """The first part of the iterations; None for an unbiased camera or too few iterations.
-
-        Whole chunks between two checks, so that a callback sees every tenth iteration throughout.
-        """
-        count = CHUNK * round(_FIRST_PART * self.iterations / CHUNK)
-        easier = without_uniform_light(problem) if count else None
-        if easier is None:
-            return None
-        outcome = iterate(
-            in_parallel(easier, admm_method),
-            image,
-            Schedule(count, self.tolerance, adapt_until=min(_BALANCED, count // 2)),
-            callback=callback,
-            objective=functools.partial(objective_with_uniform_light, problem),
-        )
-        return dataclasses.replace(outcome, image=with_uniform_light(problem, outcome.image))
 
 
 class Fista(AbstractRegularised):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import lineax
 import numpy as np
 import optimistix
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
@@ -122,10 +122,7 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
     convolved = convolutions(fixed)
-    powers = None
-    if convolved is not None:
-        powers = mean_powers(convolved, fixed.weights)
-        powers = _less_uniform(fixed, powers) if fixed.has_background else powers
+    powers = None if convolved is None else mean_powers(convolved, fixed.weights)
     return IterativeNormal(problem, shift, powers=powers)
 
 
@@ -208,10 +205,16 @@ class IterativeNormal(AbstractNormal):
     """Solutions by conjugate gradients to `INNER_TOLERANCE`.
 
     Convolutions are preconditioned by their `mean_powers`, separable cameras by the `modes` given.
+    Captures that are not `lit` have no background.
     """
 
     modes: SeparableModes | None = None
     powers: Complex[Array, "channel p q v u"] | None = None
+    lit: tuple[Bool[Array, "..."], ...] | None = None
+
+    def applied(self, image: Float[Array, "..."]):
+        seen = tuple(forward(operator, image) for operator in self.problem.operators)
+        return back_projected(self.problem, seen, self.lit) + self.shift * image
 
     def solve(self, right: Float[Array, "..."]):
         return self(right, jnp.zeros_like(right))
@@ -235,10 +238,11 @@ class IterativeNormal(AbstractNormal):
         operator = lineax.FunctionLinearOperator(
             lambda image: factor * self.applied(image), structure, tags
         )
+        # They decide how the solution is found: it has its slopes by the equation alone.
+        fixed, guess, size = jax.lax.stop_gradient((self, guess, jnp.sqrt(jnp.mean(right**2))))
         options: dict[str, Any] = {"y0": guess / factor}
-        if (filtered := self._filter()) is not None:
+        if (filtered := fixed._filter()) is not None:
             options["preconditioner"] = lineax.FunctionLinearOperator(filtered, structure, tags)
-        size = jnp.sqrt(jnp.mean(right**2))
         limits: dict[str, Any] = {"rtol": tolerance, "atol": tolerance * size}
         solver = lineax.CG(**limits, norm=optimistix.rms_norm, max_steps=steps)
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
@@ -246,7 +250,9 @@ class IterativeNormal(AbstractNormal):
 
     def _filter(self):
         if self.powers is not None:
-            return functools.partial(_filtered, self.inverse_filter())
+            left = self.problem.has_background and self.powers.shape[1] == 1
+            powers = less_uniform(self.problem, self.powers) if left else self.powers
+            return functools.partial(_filtered, replace(self, powers=powers).inverse_filter())
         return self.modes and functools.partial(_by_modes, self.modes, self.shift)
 
     def least_squares(
@@ -355,14 +361,12 @@ def mean_powers(
 
 
 @jax.jit
-def _less_uniform(problem: InverseProblem, powers: Complex[Array, "channel p q v u"]):
+def less_uniform(problem: InverseProblem, powers: Complex[Array, "channel p q v u"]):
     r"""Eigenvalues without the part of uniform light on the sensor, which is the background's.
 
     :math:`A^Tw 1 1^TwA / 1^Tw1` of n pixels has the nearest circulant eigenvalues
-    :math:`|F A^T w 1|^2 / (n\, 1^T w 1)`. Of one plane; several keep theirs.
+    :math:`|F A^T w 1|^2 / (n\, 1^T w 1)`, of one plane.
     """
-    if powers.shape[1] > 1:
-        return powers
     lost, window = 0.0, padded_field(problem.field_shape)
     for operator, weight in _weighted(problem):
         pixels = jnp.mean(weight, axis=tuple(range(weight.ndim - 2)))

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
@@ -196,14 +196,28 @@ def with_background(
     return difference - (jnp.minimum(level, 0) if background == "nonnegative" else level)
 
 
+def lit(problem: InverseProblem, image: Image) -> tuple[Bool[Array, "..."], ...]:
+    """Whether the background of each capture that fits an image best is positive."""
+    parts = zip(problem.operators, problem.captures, problem.weights, strict=True)
+    return tuple(
+        weighted_mean(w, forward(o, image) - g, len(detector_shape(o))) < 0 for o, g, w in parts
+    )
+
+
 def without_background(
-    problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
+    problem: InverseProblem,
+    differences: Sequence[Float[Array, "..."]],
+    lit: Sequence[Bool[Array, "..."]] | None = None,
 ) -> tuple[Float[Array, "..."], ...]:
-    """Captures less their means by the weights, where there is a background to find."""
+    """Captures less their means by the weights, where there is a background to find.
+
+    - `lit`: captures that have one, by default all.
+    """
     if not problem.has_background:
         return tuple(differences)
     parts = zip(problem.operators, problem.weights, differences, strict=True)
-    return tuple(with_background("unknown", w, d, len(detector_shape(o))) for o, w, d in parts)
+    found = tuple(with_background("unknown", w, d, len(detector_shape(o))) for o, w, d in parts)
+    return found if lit is None else tuple(map(jnp.where, lit, found, differences))
 
 
 def weighted_mean(
@@ -217,10 +231,12 @@ def weighted_mean(
 
 
 def back_projected(
-    problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
+    problem: InverseProblem,
+    differences: Sequence[Float[Array, "..."]],
+    lit: Sequence[Bool[Array, "..."]] | None = None,
 ) -> Float[Array, "..."]:
     r""":math:`\sum_k A_k^T w_k d_k`, of captures without their background."""
-    return _spread(problem, without_background(problem, differences))
+    return _spread(problem, without_background(problem, differences, lit))
 
 
 def _spread(problem: InverseProblem, differences: Sequence[Float[Array, "..."]]):

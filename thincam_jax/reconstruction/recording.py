@@ -180,6 +180,20 @@ class Recording(Module):
 
         return as_png(draw_recording(self))
 
+    def pixel_pitch_and_psf(self) -> tuple[float | None, Any]:
+        """Pitch of the captures' pixels, mm, and the first one's PSF; None where not known."""
+        model = self.imaging_model
+        if isinstance(model, Psfs):
+            return None, np.asarray(model.psfs)[0].reshape(-1, *model.psfs.shape[-2:])[0]
+        if not isinstance(model, Cameras):
+            return None, None
+        sensor, distance = model.cameras[0].sensor, model.object_distance
+        # Without light and distance, which fringe scanning does not need, there is none.
+        if model.over_field or model.wavelength is None or distance is None:
+            return float(sensor.pitch), None
+        nearest = np.atleast_1d(np.asarray(distance, dtype=object))[0]
+        return float(sensor.pitch), model.own_psf(0, sensor.shape, nearest)
+
     def reconstruction(
         self, outcome: Outcome, method: str, tau: float | None = None
     ) -> Reconstruction:

@@ -22,6 +22,7 @@ which `normal_equations` finds by the structure of the operators.
 """
 
 import functools
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -43,12 +44,17 @@ from thincam_jax.reconstruction.admm import (
     Penalties,
     State,
 )
-from thincam_jax.reconstruction.normal_equations import AbstractNormal, normal_equations
+from thincam_jax.reconstruction.normal_equations import (
+    AbstractNormal,
+    IterativeNormal,
+    normal_equations,
+)
 from thincam_jax.reconstruction.problem import (
     Background,
     InverseProblem,
     back_projected,
     convolutions,
+    lit,
     or_one,
     with_background,
 )
@@ -61,6 +67,8 @@ from thincam_jax.reconstruction.total_variation import (
     field_masks,
     within_field,
 )
+
+_SETS = 10  # of backgrounds that are positive, at most
 
 
 def admm_method(
@@ -364,10 +372,13 @@ class DirectSplitting(AbstractSplitting):
         mean = jax.lax.stop_gradient(or_one(power))
         self.penalties = Penalties(mean, mean, mean)
         self.normal = normal_equations(self.problem, self.penalties.data)
+        if problem.background == "nonnegative" and not isinstance(self.normal, IterativeNormal):
+            self.normal = IterativeNormal(self.problem, self.penalties.data)
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
-        pulled = back_projected(self.problem, [c / self.capture_unit for c in captures])
-        return eqx.tree_at(lambda s: s.pulled, self, pulled)
+        captures = tuple(c / self.capture_unit for c in captures)
+        pulled = back_projected(self.problem, captures)
+        return eqx.tree_at(lambda s: (s.pulled, s.problem.captures), self, (pulled, captures))
 
     def with_penalties(self, penalties: Penalties):
         normal = self.normal.shifted(penalties.data)
@@ -385,11 +396,39 @@ class DirectSplitting(AbstractSplitting):
 
     def reflected(self, state: State):
         (q,) = state.data
-        data = self.normal(self.pulled + self.penalties.data * q, q)
         shrunk = self.variation.shrink(state.slopes, self.tau / self.penalties.variation)
         slopes = tuple(2 * z - s for z, s in zip(shrunk, state.slopes, strict=True))
         allowed = jnp.abs(state.image) if self.nonnegative else state.image
-        return State((2 * data - q,), slopes, allowed)
+        return State((2 * self._data(q) - q,), slopes, allowed)
+
+    def _data(self, q: Image) -> Image:
+        """z of the data; with a background ≥ 0, solved with just those that are positive for z.
+
+        The sets are found by Newton's method, the gradient is that of the last solution.
+        """
+        if self.problem.background != "nonnegative":
+            return self.normal(self.pulled + self.penalties.data * q, q)
+
+        def solved(splitting, q, found, guess):
+            problem, normal = splitting.problem, replace(splitting.normal, lit=found)
+            pulled = back_projected(problem, problem.captures, found)
+            return normal(pulled + splitting.penalties.data * q, guess)
+
+        fixed, known = jax.lax.stop_gradient((self, q))
+
+        def step(state):
+            found, _, z, count = state
+            z = solved(fixed, known, found, z)
+            return lit(fixed.problem, z), found, z, count + 1
+
+        def going(state):
+            differ = [jnp.any(new != old) for new, old in zip(*state[:2], strict=True)]
+            return jnp.any(jnp.stack(differ)) & (state[3] < _SETS)
+
+        first = lit(fixed.problem, known)
+        start = (first, tuple(~one for one in first), known, jnp.asarray(0))
+        found, _, z, _ = jax.lax.while_loop(going, step, start)
+        return solved(self, q, found, z)
 
     def nearest(self, target: State):
         (data,) = target.data

@@ -1,5 +1,7 @@
 """High-passed problems, in which uniform or smooth light counts less or not at all."""
 
+import dataclasses
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -9,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
+from thincam_jax.reconstruction.iterate import Callback, Outcome, Schedule, iterate
+from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     compiled_objective,
@@ -18,6 +22,7 @@ from thincam_jax.reconstruction.problem import (
     uniform_level,
 )
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.splittings import admm_method
 
 # A camera is biased if its response at zero frequency is this many times the root mean square of
 # all: for a zone aperture 0.7 times its width in pixels, almost nothing where the background
@@ -52,6 +57,19 @@ def without_uniform_light(problem: InverseProblem) -> InverseProblem | None:
         return None
     biases = jax.device_get(_biases(operators))
     return high_passed(problem, [0.0 if bias > _BIASED else 1.0 for bias in biases])
+
+
+def begin_without(
+    problem: InverseProblem, image: Image, schedule: Schedule, callback: Callback | None
+) -> Outcome | None:
+    """First iterations of ADMM, without uniform light; None for an unbiased camera."""
+    easier = without_uniform_light(problem)
+    if easier is None:
+        return None
+    objective = functools.partial(objective_with_uniform_light, problem)
+    method = in_parallel(easier, admm_method)
+    outcome = iterate(method, image, schedule, callback=callback, objective=objective)
+    return dataclasses.replace(outcome, image=with_uniform_light(problem, outcome.image))
 
 
 def window_length(problem: InverseProblem) -> int:

@@ -3,9 +3,6 @@
 The names stand in `__init__.pyi`; each is imported at its first use.
 """
 
-import lazy_loader
+from thincam_jax._core.names import lazy_face
 
-from thincam_jax._core.names import modules_of
-
-_names, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__ = modules_of(__name__, _names)
+__getattr__, __dir__ = lazy_face(__name__)

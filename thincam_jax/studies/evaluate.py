@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import FieldError
+from thincam_jax.imaging.display import as_picture
 from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
@@ -241,12 +242,6 @@ def rounded(score: float, digits: int = 3) -> float | None:
 def sample(plane: ImagePlane, grid: Grid) -> Array:
     """The scene averaged over the pixels of an upright reconstruction."""
     return plane.sample(grid, magnification=1.0)
-
-
-def as_picture(image: np.ndarray) -> np.ndarray:
-    """Picture (y, x) or (y, x, channel) of an image (channel, y, x)."""
-    picture = np.moveaxis(image, 0, -1)
-    return picture[..., 0] if picture.shape[-1] == 1 else picture
 
 
 def _resolution(

@@ -26,11 +26,20 @@ PUBLISHED = (
 )
 
 
+_SHOWN = 3  # cells whose columns of the matrix are compared with the exact ones
+
+
 class ScreenCaptures(eqx.Module):
     """Captures (target, *channel, y, x), or reduced ones, and the variance of their noise."""
 
     images: Array
     variance: Array
+
+
+def diagonal_cells(shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Cells (row, column) spread along a diagonal of the object."""
+    rows, columns = ((2 * np.arange(_SHOWN) + 1) * n // (2 * _SHOWN) for n in shape)
+    return [(int(row), int(column)) for row, column in zip(rows, columns, strict=True)]
 
 
 def reconstruct_targets(

@@ -16,7 +16,7 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.waveguide.camera import SeeThroughCamera
-from thincam_jax.waveguide.rays import pixel_centres, trace
+from thincam_jax.waveguide.rays import check_screen, pixel_centres, trace
 from thincam_jax.waveguide.smear import SmearedRays, trace_band
 
 
@@ -229,3 +229,19 @@ def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: flo
         places = (np.nonzero(kept)[0], cells)
         total = total + scipy.sparse.csr_array((values[kept], places), shape=total.shape)
     return total
+
+
+def monitor_system(
+    camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 4, band_samples: int | None = None
+) -> Sparse:
+    """The matrix from a monitor's cells to the sensor: 1 where a white monitor is brightest.
+
+    **Errors**: ValueError for a screen that guides no light, or none of the monitor's.
+    """
+    check_screen(camera)
+    system = system_operator(camera, plane, orders=orders, samples=band_samples)
+    assert isinstance(system, Sparse)
+    brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
+    if not brightest > 0:
+        raise ValueError("no light from the monitor reaches the sensor")
+    return eqx.tree_at(lambda s: s.values, system, system.values / brightest)

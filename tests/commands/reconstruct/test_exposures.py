@@ -79,7 +79,9 @@ def test_merged_is_as_good_as_unsaturated(files, tmp_path):
     }.items():
         out = tmp_path / f"{name}.npy"
         result = call(out, *given)
-        assert result.exit_code == 0 and result.stderr == "", result.output
+        assert result.exit_code == 0, result.output
+        cut = "psf-2.tif: 2.74 % of the pixels have the largest value, 4095" in result.stderr
+        assert cut if name == "longest" else result.stderr == "", result.output
         scores[name] = score(out)
     assert min(scores[n] for n in ("merged", "captures", "both")) > scores["best"] - 1
     assert scores["longest"] < scores["best"] - 3

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import skimage.io
-from commands.learned.test_train import FILE
 from commands.reconstruct import simulated
 from commands.reconstruct.test_command import one_line
 from learn import tiny_network as tiny
+from learn.commands.test_train import FILE
 from typer.testing import CliRunner
 
 from thincam_jax.commands import cli
@@ -28,10 +28,10 @@ def files(tmp_path_factory):
     return folder
 
 
-def call(folder, *more, distance="80 mm"):
-    given = {"--capture": "capture.tif", "--camera": "camera.yaml", "--network": "net.thincam"}
+def call(folder, *more, network="net.thincam", background=simulated.DARK, distance="80 mm"):
+    given = {"--capture": "capture.tif", "--camera": "camera.yaml", "--network": network}
     typed = [part for option, name in given.items() for part in (option, folder / name)]
-    typed += ["--out", folder / "image.png", "--bits", 12, "--background", simulated.DARK]
+    typed += ["--out", folder / "image.png", "--bits", 12, "--background", background]
     typed += [] if distance is None else ["--distance", distance]
     return CliRunner().invoke(cli.app, ["reconstruct", *(str(part) for part in (*typed, *more))])
 
@@ -59,11 +59,8 @@ def test_what_does_not_fit_is_one_line(files):
             (call(files, "--set", "mask.beta=14 rad/mm^2")),
             "net.thincam: was trained for a camera whose camera.mask.beta was 13.0 and is 14.0",
         ),
-        ((call(files, "--network", files / "capture.tif")), "is no file of a network"),
+        ((call(files, network="capture.tif")), "is no file of a network"),
         ((call(files, "--psf", files / "capture.tif")), "give either --psf"),
-        (
-            (call(files, "--background", "found")),
-            "a network finds no background, as solvers do; give",
-        ),
+        ((call(files, background="found")), "a network finds no background, as solvers do; give"),
     ):
         assert message in one_line(given)

@@ -251,7 +251,7 @@ def test_ctrl_c_of_a_terminal(tmp_path):
     """It reaches the workers too, who keep silent; the rows are kept, and nobody stays behind."""
     file, out = mini.write(tmp_path), tmp_path / "out"
     process = subprocess.Popen(
-        command(file, out, "seed=0:9999:10000"),
+        command(file, out, "seed=0:299:300"),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

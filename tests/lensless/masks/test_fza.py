@@ -7,6 +7,7 @@ import pytest
 from lensless.propagation.reference import centred
 
 import thincam_jax as tc
+from thincam_jax.units import nm, um
 
 sample = jax.jit(lambda mask, grid: mask.sample(grid))
 
@@ -117,3 +118,13 @@ def test_integers_become_numbers_and_arrays_keep_their_precision():
     mask = tc.FresnelZoneAperture(25, width=jnp.float32(2.0))
     assert mask.beta.dtype == jnp.float64 and mask.beta == 25.0
     assert mask.width.dtype == jnp.float32
+
+
+def test_other_numbers_keep_the_display():
+    """Its pixels are of a pitch, which a copy with another β or width keeps."""
+    mask = tc.FresnelZoneAperture(25.0, width=1.6, height=0.8, pixel_pitch=20 * um)
+    assert mask.replace(beta=30.0).pixels == mask.pixels == (40, 80)
+    assert mask.replace(width=1.2).pixels == (40, 60)
+    exposure = tc.Exposures(30.0, 5.0, wavelength=500 * nm, width=1.2, profile="binary")[0]
+    shown = exposure.mask(mask)
+    assert (shown.pixels, shown.profile, shown.beta) == ((40, 60), "binary", 30.0)

@@ -509,7 +509,7 @@ def test_lenses_off_both_axes_name_the_sampled_model():
 @pytest.mark.thorough
 def test_slow_samples_are_told_beforehand(monkeypatch):
     """With the samples that are named, without a word."""
-    monkeypatch.setattr("thincam_jax.lensless.psf._SLOW", 1e8)
+    monkeypatch.setattr("thincam_jax.lensless.resolve._SLOW", 1e8)
     camera, light = tc.LenslessCamera(mura(), SENSOR, DISTANCE), {"wavelength": 500 * nm}
     light |= {"at": (0.03, 0.04)}
     with pytest.warns(AccuracyWarning, match=r"35×35 samples .* oversampling=13\) takes a tenth"):

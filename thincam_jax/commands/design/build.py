@@ -1,5 +1,8 @@
 """Study of a design's file, and a study's file of the designs found."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
 from thincam_jax._core.precision import allow
@@ -28,7 +31,6 @@ from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.training_search import TrainingError, TrainingSettings
 from thincam_jax.imaging.targets import sample_image
-from thincam_jax.learn import Denoiser
 from thincam_jax.studies.design import DesignStudy, FrontPlan, TrainingPlan, as_method
 from thincam_jax.studies.study import Method, Study, Target, synthesis_matrix
 
@@ -157,8 +159,14 @@ def _training(config: DesignConfig) -> TrainingPlan | None:
         TrainingError(asked.reconstruction),
         TrainingSettings(asked.samples, asked.starts, asked.steps, config.search.grid),
         asked.pixels,
-        Denoiser() if asked.reconstruction == "pnp" else None,
+        _denoiser() if asked.reconstruction == "pnp" else None,
     )
+
+
+def _denoiser() -> Any:
+    from thincam_jax.learn import Denoiser
+
+    return Denoiser()
 
 
 def _fronts(config: DesignConfig, problem: DesignProblem) -> FrontPlan | None:
@@ -242,4 +250,26 @@ def _method_config(config: DesignConfig, method: Method) -> MethodConfig:
     )
     return MethodConfig.model_construct(
         name=method.name, kind=method.solver.name, synthesis=method.synthesis, shots=shots
+    )
+
+
+def search(asked: Any, setup: Any) -> Iterator[str]:
+    """PSFs of the design to beat, and evaluations of a design's search."""
+    asks, shots = asked.search, asked.reference.shots
+    exposures = asked.design(asked.reference).exposures
+    cameras = exposures.cameras(asked.sensor.build(), asked.mask.build(beta=1.0))
+    words = (f"β {exposure.beta:g} rad/mm²" for exposure in exposures)
+    found = list(zip(cameras, exposures, words, strict=True))
+    yield from build.psf_costs(asked, found, asked.object.distance)
+    finely = asks.frequencies
+    most = asks.samples + asks.starts * asks.steps
+    yield (
+        f"search: {asks.samples} samples, {asks.starts} descents of at most {asks.steps} "
+        f"steps: at most {most} evaluations and their gradients at {finely.radii}×"
+        f"{finely.directions} frequencies of {len(shots)} shots"
+    )
+    again = asked.validation
+    yield (
+        f"validation: {again.best} found designs, the design to beat and {len(asked.compare)} "
+        f"others, on {len(asked.targets)} targets, noise of {again.seeds} seeds"
     )

@@ -6,11 +6,8 @@ from typing import Annotated, Literal
 import typer
 from typer import Argument, Option
 
+from thincam_jax.commands.reconstruct import METHODS
 from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, reported, say_result
-
-# What works from a measured PSF and prepared captures; "auto" then is admm-tv.
-METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
-
 
 Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
 Background = Annotated[

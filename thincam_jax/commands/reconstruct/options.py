@@ -8,7 +8,7 @@ from typing import Any, Literal
 from thincam_jax._core import checks
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
-from thincam_jax.commands.reconstruct.command import METHODS
+from thincam_jax.commands.reconstruct import METHODS
 from thincam_jax.commands.study.build import assemble, check_optics
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
@@ -326,7 +326,7 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
     """
     if read_kind(config) is KINDS["learned"]:
         # Here: other captures need not wait for the learned parts.
-        from thincam_jax.commands.learned.refocusing import build_camera
+        from thincam_jax.learn.commands.refocusing import build_camera
 
         whole = build_camera(load_experiment(config, tuple(overrides), "train"))
         if distance is None:

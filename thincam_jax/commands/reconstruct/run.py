@@ -271,9 +271,9 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
 
 def _focus(job: Job, ready: Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
     """The image of a network; its record is of the method alone."""
+    from thincam_jax.learn.plot import draw_unsure
     from thincam_jax.learn.refocusing.use import SURE, doubt, read
     from thincam_jax.plot.frame import as_png
-    from thincam_jax.plot.learned import draw_unsure
 
     began = time.perf_counter()
     if not ready.valid.all():

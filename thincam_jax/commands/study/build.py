@@ -1,13 +1,14 @@
 """Study of an experiment file: cameras, exposures, noise, targets and methods."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from thincam_jax._core.memory import readable
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.mask import MaskConfig, built_mask
 from thincam_jax.commands.sections import (
@@ -22,6 +23,7 @@ from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.imaging.targets.images import load_image, placed
 from thincam_jax.imaging.targets.patterns import point_grid
+from thincam_jax.lensless.accuracy.select import predict_cost
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.studies.evaluate import check_cameras, check_target
@@ -152,3 +154,26 @@ def check_optics(study: Study) -> None:
             place = study.config.place_of("sensor", "shape")
             raise ConfigError(f"{place}sensor.shape: {error}") from None
         raise ConfigError(f"mask, sensor or model: {error}") from None
+
+
+def psfs(asked: Any, setup: Any) -> Iterator[str]:
+    """PSFs of a study."""
+    study = assemble(asked) if setup is None else getattr(setup, "study", setup)
+    cameras = [(study.camera(e), e, study.mask_of(e)) for e in study.exposures]
+    return psf_costs(asked, cameras, study.object_distance)
+
+
+def psf_costs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[str]:
+    """A line for each PSF of (camera, exposure, words): model, predicted error, memory, work."""
+    how = {"model": asked.model, "pixel_integration": asked.pixel_integration}
+    alike = {
+        (e.beta, e.distance, e.wavelength, e.width): one for one in cameras[::-1] for e in one[1:2]
+    }
+    for camera, exposure, words in [*alike.values()][::-1]:
+        seen = {"wavelength": exposure.wavelength, "object_distance": object_distance}
+        cost, error = predict_cost(camera, **seen, **how)
+        predicted = "" if error is None else f", predicted error {error:.1g}"
+        yield (
+            f"PSF at {exposure.distance:g} mm of {words}: {asked.model}{predicted}, "
+            f"{readable(cost.bytes)}, {cost.flops / 1e9:.2g} billion operations"
+        )

@@ -14,6 +14,7 @@ from thincam_jax.commands.report import (
 )
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, as_record
 from thincam_jax.commands.sections import StudyConfig
+from thincam_jax.imaging.display import as_picture
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
 from thincam_jax.studies.evaluate import Contrasts, Evaluation, Scores, evaluate_method
@@ -108,7 +109,7 @@ class _StudyRun(Run):
     def _save_images(self, target: Target) -> None:
         """A target's scene and all reconstructions of it."""
         place, folder = slug(target.name), self.folder
-        raw = plot.as_picture(self.captures[self.study.exposures[0]].image)
+        raw = as_picture(self.captures[self.study.exposures[0]].image)
         folder.save_image(f"{place}--capture", raw / raw.max())
         shown = {"scene": plot.truth_of(self.evaluations)}
         shown |= {name: evaluation.image for name, evaluation in self.evaluations.items()}

@@ -77,7 +77,9 @@ class Numbers:
 def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
     """Rows and columns of the grid, denser at the edges of the shadow."""
     pitch, scale = float(grid.pitch), float(path.magnification)
-    shadow = path.on_mask(grid, mask.centre)
+    # Of the whole grid the sum would be compiled for each of its shapes.
+    top, left = (np.array([(1 - count) / 2]) for count in grid.shape)
+    shadow = path.on_mask(SparseGrid(top, left, grid.pitch), mask.centre)
     zone = 3 * math.sqrt(float(path.wavelength * path.distance) * scale) / pitch
     found = []
     for axis, count in enumerate(grid.shape):
@@ -201,8 +203,9 @@ class MaskProbe:
     ) -> None:
         self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
         self.lines = lines_of(mask, grid, path)
-        # Those of few fringes differ by rounding, and each count is compiled.
-        self.nodes = max(PIXEL_NODES, pixel_nodes(mask, grid, path, "float64"))
+        # Those of few fringes differ by rounding, and each count is compiled; points take none.
+        counted = pixel_nodes(mask, grid, path, "float64") if pixel_integration else 0
+        self.nodes = max(PIXEL_NODES, counted)
         self.given: dict[Precision, tuple[AbstractFactoredMask, Array, LightPath]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}

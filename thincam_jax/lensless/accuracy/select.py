@@ -30,7 +30,7 @@ from thincam_jax.lensless.method import (
 )
 from thincam_jax.lensless.propagation.obliquity import require_off_axis
 from thincam_jax.lensless.propagation.skew import corner_error
-from thincam_jax.lensless.psf import sampled_off_axis
+from thincam_jax.lensless.resolve import sampled_off_axis
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.

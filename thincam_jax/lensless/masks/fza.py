@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, centred_indices
-from thincam_jax._core.precision import as_complex, phasor
+from thincam_jax._core.precision import as_complex, decimal_value, phasor
 from thincam_jax._core.quantity import choice, quantity
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
@@ -121,6 +121,11 @@ class FresnelZoneAperture(AbstractFactoredMask):
                 else checks.whole_cells("height", height, "pixel_pitch", pixel_pitch)
             )
             self.pixels = rows, columns
+
+    @property
+    def pixel_pitch(self) -> Any:
+        """Pitch of the display that shows the mask, mm; None for a printed one."""
+        return None if self.pixels is None else decimal_value(self.width) / self.pixels[1]
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

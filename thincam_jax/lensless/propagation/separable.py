@@ -141,8 +141,8 @@ def separable(
     factored = require_factored(mask, "separable")
     terms = factored.terms(path.wavelength)
     down, across = terms.rows, terms.columns
-    scale = path.magnification
     lower, upper, weights = pairs(terms.coefficients)
+    scale = path.magnification
 
     def products(factors, path, x):
         if not pixel_integration:

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.psf import psf
 
 # Parameters that can be fitted, in the order of the tables, with their place in a `FitState`.
@@ -69,6 +70,7 @@ class FitState(eqx.Module):
 
     - `nearness`: 1/t, 1/mm; 0 is a plane wave. Unlike t, it is differentiable at infinity.
     - `synthesis`: how several captures are summed; None for one capture.
+    - `nodes`: nodes of the average over a pixel; known numbers decide, which here are traced.
     """
 
     camera: LenslessCamera
@@ -77,6 +79,7 @@ class FitState(eqx.Module):
     background: Float[Array, ""]
     gain: Float[Array, ""]
     synthesis: Synthesis | None = None
+    nodes: int | None = eqx.field(default=None, static=True)
 
     @property
     def mask(self) -> FresnelZoneAperture:
@@ -112,7 +115,8 @@ class FitState(eqx.Module):
             "wavelength": self.wavelength,
             "object_distance": 1 / self.nearness,
         }
-        return psf(camera, **light, pixel_integration=pixel_integration)
+        method = PsfMethod(nodes=self.nodes)
+        return psf(camera, **light, model=method, pixel_integration=pixel_integration)
 
     def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "FitState":
         """State after dimensionless steps of the named parameters.

@@ -186,7 +186,7 @@ def fit_psf(
     image = _check_image(psf_image, camera, synthesis)
     with allow("float64", camera):
         double = cast((camera, synthesis), "float64")
-        guess = given(double[0], object_distance, wavelength, search.parameters, double[1])
+        guess = given(double[0], object_distance, wavelength, search, double[1])
         check_fringes(guess)
         start = start_near(image, guess, search)
         names, average = unknown_names(search.parameters), search.pixel_integration

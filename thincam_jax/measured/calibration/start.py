@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,8 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.method import PIXEL_NODES
+from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
 from thincam_jax.measured.calibration.coarse import descend
 from thincam_jax.measured.calibration.problem import PARAMETERS, FitState, Synthesis
@@ -73,17 +75,19 @@ def given(
     camera: LenslessCamera,
     object_distance: Number,
     wavelength: Number,
-    parameters: Sequence[str],
+    search: PsfSearch,
     synthesis: Synthesis | None = None,
 ) -> FitState:
     """State of the camera and the point as given, with no background and a gain of one."""
     path = camera.path(wavelength, object_distance)
     nearness = 1 / path.object_distance
-    if "object_distance" in parameters:
+    if "object_distance" in search.parameters:
         nearness = jnp.maximum(nearness, _FARTHEST / camera.distance)
     none = jnp.zeros_like(nearness)
     wavelength = path.wavelength.astype(none.dtype)
-    return FitState(camera, wavelength, nearness, none, none + 1, synthesis)
+    nearest = replace(path, distance=(1 - search.relative) * path.distance)
+    nodes = max(PIXEL_NODES, pixel_nodes(camera.mask, camera.sensor.grid, nearest, "float64"))
+    return FitState(camera, wavelength, nearness, none, none + 1, synthesis, nodes)
 
 
 def check_fringes(guess: FitState) -> None:

@@ -1,0 +1,103 @@
+"""A phase-only light modulator by the commands, on the virtual rig."""
+
+import json
+
+import numpy as np
+import PIL.Image
+import pytest
+import yaml
+from commands.pages import assert_says_its_result
+from commands.test_cli import call, one_line
+from hardware.commands import tiny
+
+from thincam_jax.commands.checked_config import load_as
+from thincam_jax.hardware.commands import command
+from thincam_jax.hardware.commands.config import CaptureConfig
+from thincam_jax.hardware.commands.run import picture_levels
+from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+
+PHASES = (0.0, 0.7, 2.8, 4.9, 5.65)
+TABLE = {"phases": [f"{phase} rad" for phase in PHASES], "wavelength": "532 nm", "gap": 0.5}
+FILE = yaml.safe_load(tiny.METHOD_B) | {
+    "mask": {"family": "lenslets", "focal_length": "6.5 mm", "cell": "288 um", "lenses": [2, 2]},
+    "plan": {"kind": "scene", "frames": 2, "dark_frames": 2},
+}
+FILE["display"] |= {"fill_factor": 0.9, "phase_levels": TABLE}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("phase"), yaml.safe_dump(FILE))
+
+
+def loaded(file, *overrides):
+    return load_as(CaptureConfig, file, overrides)
+
+
+@pytest.mark.thorough
+def test_frames_are_those_of_the_phases_shown(file):
+    """A panel of other phases than its table gives other frames, by far more than the noise."""
+    found = {}
+    for name, sets in (("same", ()), ("other", ("--set", f"virtual.phase_levels={OTHER}"))):
+        store, out = file.with_name(f"{name}.zarr"), file.with_name(name)
+        for args in (("capture", file, "--out", store, *sets), ("run", store, "--out", out)):
+            result = call(*args)
+            assert result.exit_code == 0, result.output
+        metrics = json.loads((out / "metrics.json").read_text("utf-8"))
+        (found[name],) = metrics["agreement"]["frame_residual_over_noise"]
+        assert "Plan scene" in assert_says_its_result(out)
+    assert abs(found["same"] - 1) < 0.04 and found["other"] > 1.2
+
+
+OTHER = "{phases: [0 rad, 6.26 rad], wavelength: 532 nm}"
+
+
+def test_a_table_of_a_file_is_the_same_and_another_one_another_plan(file, tmp_path):
+    table = PhaseLevels(PHASES, 532e-6, gap=0.5)
+    table.save(tmp_path / "slm.json")
+    here, there = (
+        loaded(file, *sets) for sets in ((), (f"display.phase_levels={tmp_path / 'slm.json'}",))
+    )
+    assert here.display.phase_levels == there.display.phase_levels
+    plan = command.build_plan(here)
+    assert plan.hash == command.build_plan(there).hash
+    assert [plan.pattern(step).kind for step in plan.steps] == ["pixels"] * 2 + ["black"] * 2
+    other = loaded(file, "display.phase_levels.phases.1=0.9 rad")
+    assert plan.hash != command.build_plan(other).hash
+    stack = "plan={kind: psf_stack, distances: [6 mm, 7 mm]}", "stage={driver: zaber}"
+    moved = command.build_plan(loaded(file, *stack))
+    assert [moved.pattern(step).kind for step in moved.steps] == ["pixels"] * 2
+
+
+def test_phases_of_files(file, tmp_path):
+    phase = np.random.default_rng(0).uniform(-9, 9, (16, 20))
+    np.save(tmp_path / "phase.npy", phase)
+    turn = np.rint(255 * np.mod(phase, 2 * np.pi) / (2 * np.pi)).astype(np.uint8)
+    PIL.Image.fromarray(turn).save(tmp_path / "phase.png")
+    shown = []
+    for name in ("phase.npy", "phase.png"):
+        mask = f"mask={{family: phase, path: {tmp_path / name}, width: 720 um}}"
+        (levels,) = picture_levels(loaded(file, mask)).values()
+        shown.append(PhaseLevels(PHASES, 532e-6).at(532e-6)[levels])
+    assert np.abs(np.angle(np.exp(1j * (shown[0] - phase)))).max() < np.pi / 8
+    assert np.abs(np.angle(np.exp(1j * (shown[0] - shown[1])))).mean() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ("mask=null", "plan.width: optics need betas and width of the mask; give them"),
+        ("display.phase_levels=null", "display.phase_levels: and 'mask' belong together"),
+        ("display.phase_levels.phases=[1 rad]", "phase_levels.phases: 1 phases; give 2 to 256"),
+        ("display.phase_levels=none.json", "none.json"),
+        ("plan.betas=[60 rad/mm^2]", "mask: is of a scene or psf_stack with optics and without"),
+        ("plan={kind: fringe_scan}", "plan.betas: a plan of kind fringe_scan needs it"),
+        ("optics.wavelength=700 nm", "mask: the phase "),
+        ("mask={family: pinhole, width: 720 um}", "mask: it turns no phase; give lenslets, "),
+        ("mask.cell=300 um", "mask: height = 0.6 mm is not a whole number of cells of pitch"),
+        ("mask={family: phase, path: none.npy, width: 720 um}", "none.npy"),
+        ("virtual.display=[12, 80]", "mask: 16 × 16 cells do not fit into 12 × 80 pixels"),
+    ],
+)
+def test_files_that_do_not_fit(file, asked, line, tmp_path):
+    assert line in one_line(call("capture", file, "--out", tmp_path / "a.zarr", "--set", asked))

@@ -1,0 +1,87 @@
+"""Scenes and grey levels by the commands, on the virtual rig and without a display."""
+
+import json
+
+import numpy as np
+import pytest
+import tifffile
+import yaml
+from commands.pages import assert_says_its_result
+from commands.test_cli import call, one_line
+from hardware.commands import tiny
+
+from thincam_jax.commands.checked_config import load_as
+from thincam_jax.hardware.commands.command import build_plan
+from thincam_jax.hardware.commands.config import CaptureConfig
+from thincam_jax.hardware.displays.grey_levels import GreyLevels
+
+SCENE = yaml.safe_load(tiny.METHOD_B)
+SCENE["camera"]["exposure"] = "5 ms"
+SCENE["plan"] = {
+    "kind": "scene",
+    "exposures": ["5 ms", "50 ms"],
+    "frames": 3,
+    "dark_frames": 2,
+    "betas": ["60 rad/mm^2"],
+    "width": "1.44 mm",
+}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("scene"), yaml.safe_dump(SCENE))
+
+
+@pytest.mark.thorough
+def test_merged_frames_are_those_of_a_direct_simulation(file):
+    """Within the noise that the merge says; the long exposure is saturated in part."""
+    store, out = file.with_name("a.zarr"), file.with_name("out")
+    result = call("capture", file, "--out", store, "--set", "virtual.electrons=2e6")
+    assert result.exit_code == 0, result.output
+    result = call("run", store, "--out", out)
+    assert result.exit_code == 0, result.output
+    agreement = json.loads((out / "metrics.json").read_text("utf-8"))["agreement"]
+    (residual,), (bias,) = (agreement[f"frame_{what}_over_noise"] for what in ("residual", "bias"))
+    assert abs(residual - 1) < 0.04  # 64·96 pixels: 0.009
+    assert abs(bias) < 0.15  # by chance 0.013, and the display's 8 bits: 6e-4 of the light
+    frame, variance = (tifffile.imread(out / f"{name}.tif") for name in ("scene", "variance"))
+    assert frame.shape == variance.shape == (64, 96) and np.isfinite(variance).all()
+    assert "exposure 5, 50 ms" in assert_says_its_result(out)
+
+
+def test_a_real_scene_needs_neither_display_nor_optics(tmp_path):
+    raw = {key: SCENE[key] for key in ("name", "kind", "camera")} | {"rig": "real"}
+    raw["plan"] = {"kind": "scene", "frames": 3}
+    config = load_as(CaptureConfig, tiny.write(tmp_path, yaml.safe_dump(raw)))
+    assert config.drivers["display"][0] == "shutter"
+    assert len(build_plan(config).steps) == 3
+
+
+@pytest.mark.thorough
+def test_the_table_of_grey_levels_of_a_linear_display(file):
+    """Level by level, and as the display's option."""
+    store, out = file.with_name("levels.zarr"), file.with_name("levels")
+    asked = "plan={kind: grey_levels, frames: 2, betas: [60 rad/mm^2], width: 1.44 mm}"
+    sets = ("--set", asked, "--set", "acquisition.exposure=auto")
+    for args in (("capture", file, "--out", store, *sets), ("run", store, "--out", out)):
+        result = call(*args)
+        assert result.exit_code == 0, result.output
+    levels = GreyLevels.load(out / "grey_levels.json")
+    assert np.abs(levels.table.astype(int) - np.arange(256)).max() <= 2
+    assert levels.provenance["frames"] == 2
+    table = f"display.options.grey_levels={out / 'grey_levels.json'}"
+    again = call("capture", file, "--out", file.with_name("b.zarr"), *sets, "--set", table)
+    assert "display.options.grey_levels: this plan measures it; drop it" in one_line(again)
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ("optics=null", "optics: a plan of kind scene needs optics"),
+        ("plan.frames=1", "plan.frames: exposures are weighed by the noise of each"),
+        ("display={driver: sdl}", "display.pitch: a plan of kind scene is shown on pixels"),
+        ("plan.width=null", "plan.width: optics need betas and width of the mask"),
+    ],
+)
+def test_files_that_do_not_fit(file, asked, line):
+    assert line in one_line(call("capture", file, "--set", asked))

@@ -1,0 +1,250 @@
+"""Screen experiments: what a file may say, what a run finds and leaves behind."""
+
+import json
+import re
+from dataclasses import asdict
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands.pages import assert_says_its_result
+from commands.study.tiny import Told
+from PIL import Image
+from waveguide.commands import tiny
+from waveguide.studies import tiny_screen
+
+from helpers import ROOT
+from thincam_jax import waveguide as wg
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.run_folder import RunFolder, to_json
+from thincam_jax.waveguide.commands.run import build_cameras, build_screen, run_screen
+from thincam_jax.waveguide.rays import RayStatus
+from thincam_jax.waveguide.studies.calibration import MEASURED, calibrate
+
+
+def stored(path):
+    return json.loads((path / "metrics.json").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    home = tmp_path_factory.mktemp("screen")
+    study, texts = build_screen(tiny.experiment(home)), Told()
+    folder = RunFolder(home / "out")
+    run_screen(study, folder, texts)
+    return study, folder.path, stored(folder.path), texts
+
+
+PICTURES = ("rays", "field", "images", "models", "errors", "columns", "distances")
+
+
+@pytest.mark.thorough
+def test_without_a_calibration_there_is_a_report(tmp_path):
+    """Its page does not speak of one, and neither do the tables."""
+    config = tiny.experiment(tmp_path, "calibration=null", "models=[{name: right}]")
+    result = run_screen(build_screen(config), RunFolder(tmp_path / "out"), Told())
+    metrics = stored(tmp_path / "out")
+    ((name, mean, _),) = result.table().rows
+    assert name == "right" and mean == metrics["models"]["right"]["methods"]["CGM"]["mean_psnr_db"]
+    assert metrics["models"]["right"]["methods"]["CGM"]["mean_psnr_db"] > 25
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "calibration" not in metrics and "Hadamard" not in page
+
+
+@pytest.mark.thorough
+def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
+    study, metrics = tiny_screen.study(), run[2]
+    result, calibrated = study.run(), calibrate(study, tiny_screen.CALIBRATION)
+    models = {name: model.methods for name, model in result.models.items()}
+    for name, methods in (models | {MEASURED: calibrated.methods}).items():
+        for method, found in methods.items():
+            told = metrics["models"][name]["methods"][method]
+            assert told["mean_psnr_db"] == found.scores.mean_psnr_db
+            assert told["targets"] == asdict(found.scores)["targets"]
+    told, found = metrics["calibration"], json.loads(to_json(asdict(calibrated.scores)))
+    for timed in (told, told["fit"], found, found["fit"]):
+        del timed["seconds"]
+    assert told == found
+
+
+@pytest.mark.thorough
+def test_a_file_of_a_full_colour_hologram(tmp_path):
+    overrides = (
+        "hologram.wavelength=null",
+        "hologram.colours=[630 nm, 532 nm, 460 nm]",
+        "models=[{name: right}]",
+        "methods=[{name: CGM, kind: ridge}]",
+        "targets=[{name: face, kind: photograph, image: astronaut}]",
+    )
+    with pytest.raises(ConfigError, match="calibration.distances: need a hologram of one colour"):
+        tiny.experiment(tmp_path, *overrides)
+    study = build_screen(tiny.experiment(tmp_path, *overrides, "calibration=null"))
+    np.testing.assert_allclose(study.wavelengths[0] / study.wavelengths[1], 630 / 532, rtol=1e-6)
+    assert len(study.cameras) == 3 and study.targets["face"].shape == (8, 16, 3)
+    run_screen(study, RunFolder(tmp_path / "out"), Told())
+    pictures = [np.asarray(Image.open(path)) for path in (tmp_path / "out/images").iterdir()]
+    assert pictures and all(picture.shape == (8, 16, 3) for picture in pictures)
+    assert all(np.ptp(picture.astype(int), axis=-1).max() > 20 for picture in pictures)
+    score = stored(tmp_path / "out")["models"]["right"]["methods"]["CGM"]["mean_psnr_db"]
+    assert score > 20
+
+
+RESPONSES = "hologram.responses=[{}]".format(
+    ", ".join(f"{{centre: {centre} nm, width: 80 nm}}" for centre in (610, 535, 465))
+)
+
+
+def test_a_file_of_a_colour_sensor(tmp_path):
+    with pytest.raises(ConfigError, match="hologram.responses: are to three colours; give colours"):
+        tiny.experiment(tmp_path, RESPONSES)
+    colours = "hologram.wavelength=null", "hologram.colours=[633 nm, 532 nm, 473 nm]"
+    face = "targets=[{name: face, kind: photograph, image: astronaut}]"
+    config = tiny.experiment(tmp_path, *colours, RESPONSES, face, "calibration.distances=[]")
+    study = build_screen(config)
+    assert study.responses[1].centre == pytest.approx(535e-6) and len(study.responses) == 3
+
+
+def test_the_angle_of_a_file_is_the_tilt_of_the_plate(tmp_path):
+    config = tiny.experiment(tmp_path, "screen.tilt=[0.4 deg, -0.2 deg]")
+    np.testing.assert_allclose(build_screen(config).camera.tilt, np.deg2rad([0.4, -0.2]))
+
+
+@pytest.mark.thorough
+def test_progress_and_files(run):
+    study, path, _, texts = run
+    assert len(texts) == texts.total == 1 + 3 * 2 + (1 + 2 + 1 + 1) + 1
+    names = {p.name for p in (path / "figures").iterdir()}
+    assert names == {f"{n}.png" for n in PICTURES}
+    assert len(list((path / "images").iterdir())) == 2 * 2
+    assert not list(path.glob("*.zarr"))  # keep_captures
+    assert tiny.experiment(path, text=(path / "config.yaml").read_text("utf-8")) == study.config
+
+
+@pytest.mark.thorough
+def test_report_stands_alone_and_is_escaped(run):
+    page = assert_says_its_result(run[1])
+    sources = re.findall(r'src="([^"]+)"', page)
+    assert len(sources) == len(PICTURES)
+    assert all(source.startswith("data:image/") for source in sources)
+    assert "&lt;b&gt;of its own&lt;/b&gt;" in page
+    assert ">16.8</td>" in page  # published
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("hologram.wavelength=null", "hologram.wavelength: give it, such as 532 nm, or three"),
+        ("methods.0.variation.tau=2", "methods[0].variation: kind ridge does not take it"),
+        (
+            "targets.0.published={FISTA: {psnr_db: 3, seconds: 1}}",
+            "targets[0].published.FISTA: 'FISTA' is no method; choose one of CGM, smooth",
+        ),
+        ("calibration.fitted=[tilt, tilt]", "calibration.fitted: names one number twice"),
+        ("calibration.offset=512", "calibration.offset: 512 fills half of the 10 bits"),
+        (
+            "calibration.display=binary",
+            "calibration.display: a binary display with an offset needs dark frames",
+        ),
+        ("models.1.name=measured matrix", "models[1].name: 'measured matrix' is the name of the"),
+    ],
+)
+def test_faults_are_told_in_one_line_with_their_place(override, part, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        tiny.experiment(tmp_path, override)
+    line = str(caught.value).split("\n")[0]
+    assert line.startswith("--set ")
+    assert part in line
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("hologram.reference_angle=40 deg", "under the critical angle of 41.81°"),
+        ("screen.glass_index=1.3", "a glass of n = 1.3 cannot carry"),
+        (
+            "screen.bottom.height=12 mm",
+            r"smaller than one bounce of the guided light, \(18.19, 0\)",
+        ),
+    ],
+)
+def test_a_plate_that_guides_no_light_is_refused(override, part, tmp_path):
+    config = tiny.experiment(tmp_path, override)
+    with pytest.raises(ConfigError, match=rf"tiny.yaml:\d+: screen: .*{part}"):
+        build_screen(config)
+
+
+def test_cells_that_are_no_power_of_two_are_told_with_their_line(tmp_path):
+    text = tiny.TEXT.replace("[8, 16]", "[12, 16]")
+    told = r"tiny.yaml:\d+: object.cells: 12 × 16 = 192 cells are no power of two, as Hadamard"
+    with pytest.raises(ConfigError, match=told) as caught:
+        tiny.experiment(tmp_path, text=text)
+    assert str(caught.value).count("\n") == 0
+    tiny.experiment(tmp_path, "calibration=null", text=text)
+
+
+def test_a_camera_that_sees_nothing_is_refused(tmp_path):
+    config = tiny.experiment(tmp_path, "screen.bottom.y=900 mm")
+    with pytest.raises(ConfigError, match=r"tiny.yaml:\d+: screen: no ray .* off hologram"):
+        build_screen(config)
+
+
+def test_the_shipped_file(tmp_path):
+    shipped = tiny.experiment(tmp_path, text=(ROOT / "configs/sts_camera.yaml").read_text("utf-8"))
+    assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
+    assert shipped.sensor.shape == (440, 440)
+    assert {model.mistake for model in shipped.models} >= {"grating", "ghost_index"}
+    (camera,) = build_cameras(shipped)
+    status = wg.trace(camera, jnp.zeros(2), object_distance=550.0, orders=4).status
+    assert status.tolist() == [0, 0, 0, RayStatus.OFF_HOLOGRAM]  # of the thesis' size
+
+
+MASK = "mask: {beta: 6 rad/mm^2, width: 1.4 mm, distance: 6.5 mm, gap: 0.5 mm, points: 3}"
+WITH_MASK = re.sub(r"calibration:.*?(?=targets:)", "", tiny.TEXT, flags=re.DOTALL)
+for _lens, _mask in (
+    ("lens: {focal_distance: 6 mm, lens_distance: 10 mm}", MASK),
+    ("{shape: [22, 30], pitch: 70.4 um}", "{shape: [24, 32], pitch: 130 um}"),
+    ("distance: 550 mm, width: 120 mm, y: 27 mm", "distance: 550 mm, width: 150 mm, y: 9 mm"),
+    ("band_samples: 3\n", ""),
+):
+    assert _lens in WITH_MASK
+    WITH_MASK = WITH_MASK.replace(_lens, _mask)
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("lens={focal_distance: 6 mm, lens_distance: 10 mm}", "mask: give a lens, or a mask in"),
+        ("mask=null", "mask: give a lens, or a mask in its place"),
+        ("calibration={bits: 10}", "calibration: measures a camera with a lens; drop it"),
+        ("screen.tilt=[1 deg, 0 deg]", "screen.tilt: a mask is parallel to the plate; drop"),
+        ("models.1.mistake=grating", "models[1].mistake: 'grating' is of a camera with a lens; ch"),
+        ("mask.focal_distance=6 mm", "mask.focal_distance: unknown key; allowed here: width"),
+        ("mask.points=4", "mask.points: points = 4 is even; give 5"),
+        ("mask={width: 1.4 mm, distance: 6 mm, gap: 1 mm}", "mask.beta: missing; this key is"),
+    ],
+)
+def test_what_does_not_hold_behind_a_mask_is_refused_in_one_line(override, part, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        tiny.experiment(tmp_path, override, text=WITH_MASK)
+    (line,) = str(caught.value).split("\n")
+    assert part in line
+
+
+@pytest.mark.thorough
+def test_a_file_with_a_mask_in_place_of_the_lens(tmp_path):
+    """The right model is the best one, and the page says what stands before the sensor."""
+    smooth = "{name: CGM, kind: admm_tv, variation: {tau: 0.1, iterations: 60}}"
+    config = tiny.experiment(tmp_path, f"methods=[{smooth}]", text=WITH_MASK)
+    assert tiny.experiment(tmp_path, text=dump_config(config)) == config
+    result = run_screen(build_screen(config), RunFolder(tmp_path / "out"), Told())
+    means = {
+        name: model.methods["CGM"].scores.mean_psnr_db or 0.0
+        for name, model in result.models.items()
+    }
+    assert means["right"] > 19 and means["right"] > means["convolution"]
+    assert means["right"] > means["single"] + 5
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "1.4 mm (cosine), 6.5 mm before it" in page and "s shadow, once for each order" in page
+    assert {p.stem for p in (tmp_path / "out/figures").iterdir()} == set(PICTURES[:5])
+    assert stored(tmp_path / "out")["entries_of_the_system"] == 24 * 32 * 8 * 16

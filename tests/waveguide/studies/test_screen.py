@@ -1,0 +1,127 @@
+"""Screen studies: the right model is the best, and the mistakes are those of the thesis."""
+
+import numpy as np
+import pytest
+from matplotlib import pyplot
+from waveguide.studies import tiny_screen
+
+import thincam_jax as tc
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.studies.pictures import PublishedImage
+from thincam_jax.units import nm
+from thincam_jax.waveguide.studies.screen import ScreenModel, mistaken_rays, summarise_rays
+
+SINGLE = (ScreenModel("right"), ScreenModel("single", "no_ghosts"))
+
+
+@pytest.fixture(scope="module")
+def study():
+    return tiny_screen.study()
+
+
+@pytest.fixture(scope="module")
+def result(study):
+    return study.run()
+
+
+def means(model):
+    return np.array([method.scores.mean_psnr_db for method in model.methods.values()])
+
+
+@pytest.mark.thorough
+def test_forgotten_ghosts_cost_an_image():
+    study = tiny_screen.study(models=SINGLE, solvers={"CGM": tc.Ridge(1.0)})
+    texts = []
+    result = study.run(lambda text, count: texts.append((text, count)))
+    assert texts == [("rays and captures", 3), ("right: CGM", 3), ("single: CGM", 3)]
+    right, single = (result.models[name].methods["CGM"] for name in ("right", "single"))
+    assert right.images.shape == (2, 8, 16)
+    assert right.scores.mean_psnr_db > 25
+    assert right.scores.mean_psnr_db > single.scores.mean_psnr_db + 1.5
+    first, second = result.errors_table().rows
+    loss = right.scores.mean_psnr_db - single.scores.mean_psnr_db
+    assert first[0] == "right" and first[-2] == 0 and second[-2] == pytest.approx(loss)
+    published = {list(study.targets)[0]: {"CGM": PublishedImage(16.8)}}
+    rows = result.published_table(published).rows
+    assert rows[0][-2:] == (16.8, None) and rows[1][-2:] == (None, None)
+    try:
+        assert [ax.get_title() for ax in result.plot().axes[:3]] == [
+            "target",
+            "capture, turned",
+            "CGM",
+        ]
+    finally:
+        pyplot.close("all")
+    of_targets = [score.psnr_db for score in right.scores.targets.values()]
+    assert right.scores.mean_psnr_db == pytest.approx(np.mean(of_targets), abs=1e-3)
+
+
+@pytest.mark.thorough
+def test_the_right_model_is_the_best(result):
+    for name in ("convolution", "single"):
+        assert (means(result.models["right"]) > means(result.models[name]) + 1.5).all()
+    assert means(result.models["right"]).min() > 25
+    assert result.models["single"].mistake == "the first image alone, with a glass of 5.2 mm"
+
+
+@pytest.mark.thorough
+def test_a_full_colour_hologram_gives_a_colour_picture():
+    """Each channel by its own hologram, and without ghosts it is worse."""
+    study = tiny_screen.study(
+        *(tiny_screen.camera(wavelength * nm) for wavelength in (630, 532, 460)),
+        models=SINGLE,
+        solvers={"CGM": tc.Ridge(1.0)},
+        targets={"face": resize(sample_image("astronaut", linear=True), tiny_screen.CELLS)},
+    )
+    light = study.wavelengths
+    np.testing.assert_allclose(light[0] / light[1], 630 / 532, rtol=1e-12)
+    right, single = (model.methods["CGM"] for model in study.run().models.values())
+    assert right.scores.mean_psnr_db > 25
+    assert right.scores.mean_psnr_db > single.scores.mean_psnr_db + 3
+    assert right.images.shape == (1, 8, 16, 3) and np.ptp(right.images, axis=-1).max() > 0.1
+
+
+@pytest.mark.thorough
+def test_rays_are_those_of_the_plate(study):
+    rays = summarise_rays(study, study.rays())
+    low, high = rays.wavelength_nm
+    assert 480 < low < 532 < high < 575
+    assert rays.guided_angle_deg[0] > 41.8
+    assert rays.first_ghost_down_mm[0] < 18.19 < rays.first_ghost_down_mm[1]
+    assert sum(rays.status_percent.values()) == pytest.approx(100, abs=0.1)
+    assert rays.status_percent["off_hologram"] > 0
+
+
+@pytest.fixture(scope="module")
+def right(study):
+    return mistaken_rays(study, study.camera, "none")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("mistake", "on_axis"),
+    [
+        ("none", 0.0),
+        ("shift_invariant", 0.0),
+        ("grating", 0.0),
+        ("ghost_index", -18.19),
+        ("no_smear", 0.0),
+    ],
+)
+def test_mistakes_are_those_of_the_thesis(study, right, mistake, on_axis):
+    """All but the ghost index agree on the axis, and none elsewhere."""
+    wrong = mistaken_rays(study, study.camera, mistake)
+    moved = np.mean(wrong.points - right.points, axis=-2)[..., 0]
+    rows, columns = study.camera.sensor.shape
+    middle = moved[:, rows // 2 - 1 : rows // 2 + 1, columns // 2 - 1 : columns // 2 + 1].mean(
+        (1, 2)
+    )
+    np.testing.assert_allclose(middle, on_axis, atol=0.05)
+    assert (np.ptp(moved[0]) > 1) == (mistake not in ("none", "no_smear"))
+
+
+@pytest.mark.thorough
+def test_the_printed_grating_needs_the_recording(study):
+    unknown = tiny_screen.study(recording_angles=None)
+    with pytest.raises(ValueError, match="give the study recording_angles"):
+        mistaken_rays(unknown, unknown.camera, "grating")

@@ -1,0 +1,6 @@
+"""The names of `thincam_jax.learn`; `__init__.py` reads them from here."""
+
+from .denoiser.network import Denoiser as Denoiser
+from .refocusing.network import RefocusNetwork as RefocusNetwork
+from .tau import learn_tau as learn_tau
+from .unrolled import UnrolledAdmm as UnrolledAdmm

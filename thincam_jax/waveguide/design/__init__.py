@@ -1,0 +1,1 @@
+"""Designs of a plate: its glass and its hologram."""

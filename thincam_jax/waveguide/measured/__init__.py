@@ -1,0 +1,1 @@
+"""Screens from captures: the rays that fit a measured matrix."""
