@@ -171,6 +171,7 @@ def options(
 ) -> None:
     """Simulate and reconstruct thin computational cameras."""
     os.environ["THINCAM_CACHE"] = "on" if cache else "off"
+    os.environ["THINCAM_PROGRESS"] = "off"  # commands have bars
     if cache:
         keep_programs()
 

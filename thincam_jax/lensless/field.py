@@ -13,6 +13,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank, LowRankFit, principal_psfs
@@ -31,6 +32,7 @@ _LEAST_POINTS, _MOST_POINTS = 3, 21
 
 
 @checked
+@watched("computing PSFs over the field")
 def field_operator(
     camera: LenslessCamera,
     light: Spectrum | Number,

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix
 from thincam_jax.imaging.operators.low_rank import LowRank
@@ -112,6 +113,11 @@ def reconstruct(
 
     **See also**: `Recording`, `AdmmTV`, `Wiener`, `choose_solver`.
     """
+    with watched("reconstructing") as tell:
+        return _reconstruct(recording, solver, start, callback, tell)
+
+
+def _reconstruct(recording: Recording, solver, start, callback, tell) -> Reconstruction:
     reason = ""
     if solver is None:
         solver, reason = choose_solver(recording)
@@ -123,7 +129,13 @@ def reconstruct(
                 f"{type(solver).__name__} checks its convergence between iterations: call it "
                 "outside of jit, grad and vmap, or use tc.reconstruction.solve_fixed_point there"
             )
-        result = solver.solve(recording, start=start, callback=callback)
+
+        def watcher(progress):
+            tell(progress.iteration, getattr(solver, "iterations", 0))
+            return callback is not None and callback(progress)
+
+        in_one_piece = callback is None and isinstance(solver, PoissonTV)
+        result = solver.solve(recording, start=start, callback=None if in_one_piece else watcher)
     elif start is not None or callback is not None:
         raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:

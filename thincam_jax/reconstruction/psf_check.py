@@ -15,6 +15,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum
+from thincam_jax._core.progress import watched
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
@@ -116,6 +117,7 @@ def searched(
 
 
 @checked
+@watched("checking the PSF")
 def check_psf(
     recording: Recording,
     *,

@@ -8,6 +8,7 @@ import numpy as np
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax._core.random import random_key
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise
@@ -20,6 +21,7 @@ from thincam_jax.reconstruction.recording import Recording
 
 
 @checked
+@watched("recording")
 def record(
     camera: LenslessCamera | Sequence[LenslessCamera],
     scene: Scene,

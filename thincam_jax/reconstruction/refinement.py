@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
@@ -96,6 +97,7 @@ class _Fit:
 
 
 @checked
+@watched("refining the model")
 def refine(
     recording: Recording,
     *,

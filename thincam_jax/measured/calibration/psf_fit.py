@@ -15,6 +15,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantities, unchecked
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -106,6 +107,7 @@ class PsfFit(Module):
 
 
 @checked
+@watched("fitting the PSF")
 def fit_psf(
     psf_image: Numbers | Inexact[ArrayLike, "y x"],
     camera: LenslessCamera,

@@ -1,0 +1,90 @@
+"""A line for who waits: what a long call is doing, since when, and how long at most."""
+
+import contextlib
+import contextvars
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+# Seconds until the first line, between two that are seen, and between two of a log.
+_PATIENCE, _OFTEN, _SELDOM = 1.0, 0.5, 10.0
+_FIRST = "compiling, if this is the first of its size"
+
+_is_watched = contextvars.ContextVar("is_watched", default=False)
+
+
+@contextlib.contextmanager
+def watched(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show `what` goes on while it does; also a decorator.
+
+    Yields a function of the step done and the most that there can be. Nothing is shown of what
+    takes less than a second, or within another watched call. At a terminal and in a notebook the
+    line is written to stderr and goes at the end, elsewhere it is logged every ten seconds, as
+    information. THINCAM_PROGRESS=off in the environment ends it.
+    """
+    if _is_watched.get() or os.environ.get("THINCAM_PROGRESS") == "off":
+        yield lambda step, most: None
+        return
+    line, over = _Line(what), threading.Event()
+    speaker = threading.Thread(target=line.repeat, args=(over,), daemon=True)
+    token = _is_watched.set(True)
+    speaker.start()
+    try:
+        yield line.tell
+    finally:
+        _is_watched.reset(token)
+        over.set()
+        speaker.join()
+        line.show("")
+
+
+class _Line:
+    """The line of one call."""
+
+    def __init__(self, what: str):
+        self.what, self.began = what, time.monotonic()
+        self.first: tuple[int, float] | None = None
+        self.now = (0, 0)
+        self.stream, self.width = sys.stderr, 0
+        self.is_live = self.stream.isatty() or _in_notebook()
+
+    def tell(self, step: int, most: int) -> None:
+        self.now = (step, most)
+        self.first = self.first or (step, time.monotonic())
+
+    def repeat(self, over: threading.Event) -> None:
+        pause = _PATIENCE if self.is_live else _SELDOM
+        while not over.wait(pause):
+            if self.is_live:
+                self.show(str(self))
+                pause = _OFTEN
+            else:
+                logging.getLogger(__name__).info("%s", self)
+
+    def show(self, text: str) -> None:
+        """Write the text over the one before; nothing over nothing."""
+        if text or self.width:
+            line = "\r" + text.ljust(self.width) + ("" if text else "\r")
+            with contextlib.suppress(OSError, ValueError):  # of a stream that was closed
+                self.stream.write(line)
+                self.stream.flush()
+            self.width = len(text)
+
+    def __str__(self) -> str:
+        spent = f"{self.what}, {time.monotonic() - self.began:.0f} s"
+        if self.first is None:
+            return f"{spent}: {_FIRST}"
+        (start, since), (step, most) = self.first, self.now
+        text = f"{spent}: step {step} of at most {most}"
+        if step == start:
+            return text
+        left = (time.monotonic() - since) / (step - start) * (most - step)
+        return f"{text}, at most {left:.0f} s left"
+
+
+def _in_notebook() -> bool:
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")
