@@ -139,6 +139,7 @@ def test_a_browser_shows_the_last_value_of_a_drag(shown):
     assert shown.evaluate("document.documentElement.scrollWidth") <= 1100
     sizes = shown.evaluate("[...document.images].map((one) => one.naturalWidth)")
     assert len(sizes) == 3 and min(sizes) > 20 and not shown.faults
+    assert not shown.locator(".tc-empty").count()  # which say "compiling…"
 
 
 @pytest.mark.thorough

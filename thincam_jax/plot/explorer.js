@@ -13,6 +13,9 @@ const STYLE = `
 .tc-pictures canvas { background: #fff; }
 .tc-pictures figcaption { font-size: 13px; margin-top: .2rem; }
 .tc-pictures img:not([src]) { visibility: hidden; }
+.tc-empty { position: relative; outline: 1px solid #999; }
+.tc-empty::before { content: attr(data-wait); position: absolute; inset: 45% 0 auto; text-align: center; }
+.tc-empty canvas { visibility: hidden; }
 .tc-stale { opacity: .45; }
 .tc-lines { margin: .8rem 0 0; min-height: 2.8em; }`;
 
@@ -118,8 +121,11 @@ export function mount(root, controls, request, captions = null, live = false) {
   const pictures = element("div", place, { className: "tc-pictures" });
   const lines = element("p", place, { className: "tc-lines", ariaLive: "polite" });
   const values = {}, shown = {}, addresses = {};
+  const brief = live ? "waiting for the camera…" : "compiling…"; // in a panel still empty
+  const filled = (name) => shown[name].parentElement.classList.remove("tc-empty");
   for (const [name, caption] of Object.entries(captions ?? CAPTIONS)) {
-    const figure = element("figure", pictures);
+    const figure = element("figure", pictures, { className: "tc-empty" });
+    figure.dataset.wait = brief;
     shown[name] = element(name === "transfer" ? "canvas" : "img", figure, { alt: caption });
     element("figcaption", figure, { textContent: caption });
   }
@@ -137,12 +143,17 @@ export function mount(root, controls, request, captions = null, live = false) {
       URL.revokeObjectURL(addresses[name]);
       addresses[name] = URL.createObjectURL(blobs[index]);
       shown[name].src = addresses[name];
+      filled(name);
     });
     for (const name of Object.keys(shown)) {
+      if (!header.names.length) shown[name].parentElement.dataset.wait = ""; // an error, told below
       const stale = !header.names.includes(name) && !["psf", "transfer"].includes(name);
       shown[name].classList.toggle("tc-stale", stale);
     }
-    if (header.transfer.length) draw(shown.transfer, header);
+    if (header.transfer.length) {
+      draw(shown.transfer, header);
+      filled("transfer");
+    }
     lines.textContent = header.lines.join(" ");
     place.dataset.values = JSON.stringify(header.values);
     place.dataset.count = Number(place.dataset.count ?? 0) + 1;
