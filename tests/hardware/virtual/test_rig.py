@@ -12,7 +12,7 @@ from helpers import read_fiducial
 from thincam_jax.hardware import CameraSettings, registry
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.displays.phase_levels import PhaseLevels
-from thincam_jax.hardware.errors import NotFound
+from thincam_jax.hardware.errors import NotHomed, OutOfRange
 from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 from thincam_jax.hardware.virtual.faults import Faults
@@ -242,17 +242,50 @@ def test_a_pattern_of_another_shape_is_refused():
         rig().on_show(np.zeros((8, 4), np.uint8))
 
 
-def test_a_virtual_device_names_the_extra_that_is_missing(monkeypatch):
-    """A twin needs the libraries of the real device."""
-
+def without_libraries(monkeypatch):
     def not_installed(name):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(registry, "import_module", not_installed)
-    devices = VirtualDevices(VirtualRig.__new__(VirtualRig))
-    for connect, driver in ((devices.camera, "usb3_vision"), (devices.stage, "zaber")):
-        with pytest.raises(NotFound, match=r"pip install 'thincam-jax\[hardware\]'"):
-            connect(driver)
+
+
+def test_without_its_library_a_plain_device_gives_the_same_frames(monkeypatch, caplog):
+    """The extra that brings the protocol is told."""
+    frames = []
+    for is_missing in (False, True):
+        with VirtualDevices(rig()) as devices:
+            if is_missing:
+                without_libraries(monkeypatch)
+            camera, stage = devices.camera("usb3_vision"), devices.stage("zaber")
+            stage.home()
+            assert stage.move_to(12.5) == stage.position() == pytest.approx(12.5, abs=1e-3)
+            settings = dataclasses.replace(SETTINGS, region=Region(2, 4, 20, 32))
+            taken = camera.configure(settings)
+            camera.flush()
+            devices.rig.on_step(3)
+            frames.append((taken.region, camera.trigger_and_grab(1.0)))
+            camera.close()
+    (region, real), (also, plain) = frames
+    assert region == also == Region(2, 4, 20, 32)
+    np.testing.assert_array_equal(real.pixels, plain.pixels)
+    assert (real.exposure, real.bit_depth) == (plain.exposure, plain.bit_depth)
+    assert "pip install 'thincam-jax[hardware]'; the virtual rig goes on" in caplog.text
+
+
+def test_a_plain_device_refuses_what_a_real_one_does(monkeypatch):
+    without_libraries(monkeypatch)
+    devices = VirtualDevices(rig())
+    camera, stage = devices.camera("usb3_vision"), devices.stage("zaber")
+    with pytest.raises(OutOfRange, match="give a smaller region"):
+        camera.configure(dataclasses.replace(SETTINGS, region=Region(60, 0, 20, 32)))
+    with pytest.raises(OutOfRange, match="give one of Mono8"):
+        camera.configure(dataclasses.replace(SETTINGS, pixel_format="Mono7"))
+    with pytest.raises(OutOfRange, match="give Software"):
+        camera.configure(dataclasses.replace(SETTINGS, trigger="Line0"))
+    with pytest.raises(NotHomed, match="home it before"):
+        stage.move_to(1.0)
+    with pytest.raises(OutOfRange, match="give 0 to 50 mm"):
+        stage.move_to(51.0)
 
 
 def test_a_monitor_is_seen_where_its_pixels_are_in_space():

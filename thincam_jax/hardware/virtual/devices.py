@@ -2,9 +2,10 @@
 
 They use the real protocols: USB3 Vision behind a backend of pyusb in this process, the vendor's
 emulator for pylon, Zaber and GRBL on pseudo-terminals. Only a display has no protocol. Nothing
-listens on a network.
+listens on a network. Where the library of a driver is missing, a plain device takes its place.
 """
 
+import logging
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any
@@ -14,6 +15,7 @@ from thincam_jax.hardware.base import Camera, Display, Stage
 from thincam_jax.hardware.errors import NotFound
 from thincam_jax.hardware.virtual.display import VirtualDisplay
 from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.plain import PlainCamera, PlainStage
 from thincam_jax.hardware.virtual.rig import VirtualRig
 
 
@@ -35,8 +37,9 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         """Open the camera by usb3_vision or pylon; `options` except the camera's address."""
         if driver not in ("usb3_vision", "pylon"):
             raise _none_virtual("cameras", driver, "usb3_vision or pylon")
-        registry.driver("cameras", driver)  # says which library is missing before its twin needs it
         shape, faults = self.rig.optics.sensor_shape, self.faults["camera"]
+        if _lacks_library("cameras", driver):
+            return PlainCamera(self.rig.expose, shape)
         if driver == "pylon":
             from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
 
@@ -54,7 +57,9 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         """Open the stage by zaber or grbl; `options` except its port."""
         if driver not in ("zaber", "grbl"):
             raise _none_virtual("stages", driver, "zaber or grbl")
-        registry.driver("stages", driver)
+        if _lacks_library("stages", driver):
+            self._there.setdefault("stage", PlainStage(self.rig.on_move))
+            return self._there["stage"]
         if "stage" not in self._there:
             from thincam_jax.hardware.virtual.grbl import VirtualGrbl
             from thincam_jax.hardware.virtual.zaber import VirtualZaber
@@ -76,6 +81,17 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _lacks_library(kind: str, driver: str) -> bool:
+    """Whether a driver cannot be imported, which is logged."""
+    try:
+        registry.driver(kind, driver)
+    except NotFound as error:
+        text = "%s; the virtual rig goes on without its protocol and faults"
+        logging.getLogger(__name__).warning(text, error)
+        return True
+    return False
 
 
 def _none_virtual(kind: str, driver: str, known: str) -> NotFound:

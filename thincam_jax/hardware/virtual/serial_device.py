@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.plain import TRAVEL
 
 TICK = 0.002  # s between two updates of a moving slide
 LONGEST_INPUT = 1024  # bytes kept of an unfinished line
@@ -33,7 +34,7 @@ Virtual = TypeVar("Virtual", bound="VirtualSerialDevice")
 class Motion:
     """Motion of a virtual stage, and the delay of its answers with the fault "latency"."""
 
-    travel: float = 50.0  # mm
+    travel: float = TRAVEL  # mm
     speed: float = 100.0  # mm/s
     start: float = 0.0  # mm, position at power-on
     latency: float = 0.05  # s
