@@ -2,7 +2,6 @@
 
 import threading
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,6 @@ from reconstruction import rig, scenes
 
 import thincam_jax as tc
 from helpers import quick, relative_l2
-from thincam_jax.reconstruction.admm import Penalties
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import (
     ParallelMethod,
@@ -117,18 +115,6 @@ def test_units_and_penalties_do_not_depend_on_the_batch():
         )
     )
     np.testing.assert_allclose(both.image[0], alone.image, rtol=1e-10, atol=1e-12)
-
-
-def test_each_part_takes_the_penalties_of_its_part_of_another_method():
-    method = ParallelMethod(scenes.problem(batch=(2,))[0], admm)
-    first, second = (
-        Penalties(*map(jnp.asarray, values)) for values in ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-    )
-    other = eqx.tree_at(
-        lambda m: [one.arguments.penalties for one in m.methods], method, [first, second]
-    )
-    found = [one.arguments.penalties for one in method.like(other).methods]
-    assert eqx.tree_equal(found, [first, second])
 
 
 def test_only_independent_parts_run_in_parallel():

@@ -26,12 +26,7 @@ import optimistix
 from jaxtyping import Array, Float, PyTree
 
 from thincam_jax._core.checks import Number
-from thincam_jax.reconstruction.iterate import (
-    AbstractMethod,
-    OptimistixMethod,
-    Residuals,
-    SolverState,
-)
+from thincam_jax.reconstruction.iterate import OptimistixMethod, Residuals, SolverState
 from thincam_jax.reconstruction.problem import InverseProblem, compiled_objective
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -246,10 +241,6 @@ class AdmmMethod(OptimistixMethod):
 
     def objective(self, image: Image):
         return compiled_objective(self.problem, image)
-
-    def like(self, other: AbstractMethod[Any]) -> "AdmmMethod":
-        penalties = other.arguments.penalties  # type: ignore[attr-defined]
-        return eqx.tree_at(lambda m: m.arguments, self, self.arguments.with_penalties(penalties))
 
     def adapt(self, state: SolverState, residuals: Residuals):
         """Residual balancing: μ ← μ·√(primal/dual) of each split, by at most 3 at a time."""

@@ -58,7 +58,6 @@ class Outcome(eqx.Module):
     """The image with the lowest objective among those checked, and the history of the run.
 
     - `reason`: note about the result for the user; "" for none.
-    - `method`: the method as it was adapted.
     """
 
     image: Image
@@ -67,7 +66,6 @@ class Outcome(eqx.Module):
     iterations: int
     seconds: float
     reason: str = ""
-    method: Any = None
 
 
 class AbstractMethod(eqx.Module, Generic[Method_State]):
@@ -98,10 +96,6 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
     ) -> tuple["AbstractMethod[Method_State]", Method_State]:
         """The method and the state after adapting the method's parameters to the residuals."""
         return self, state
-
-    def like(self, other: "AbstractMethod[Any]") -> "AbstractMethod[Method_State]":
-        """This method with the parameters to which another was adapted."""
-        return self
 
 
 class SolverState(eqx.Module):
@@ -233,7 +227,7 @@ def iterate(
     except KeyboardInterrupt:
         status = "interrupted"
     seconds = time.perf_counter() - began
-    return Outcome(best, status, tuple(history), done, seconds, method=method)
+    return Outcome(best, status, tuple(history), done, seconds)
 
 
 def _settled(history: Sequence[Progress], share: float) -> bool:

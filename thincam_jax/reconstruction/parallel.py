@@ -67,10 +67,6 @@ class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
         methods, states = zip(*adapted, strict=True)
         return eqx.tree_at(lambda a: a.methods, self, methods), states
 
-    def like(self, other: AbstractMethod[Any]):
-        pairs = zip(self.methods, other.methods, strict=True)  # type: ignore[attr-defined]
-        return eqx.tree_at(lambda a: a.methods, self, tuple(m.like(o) for m, o in pairs))
-
     def _split(self, image: Image):
         return _parts(image, (len(self.methods), -1, *self.shape[-3:]))
 
