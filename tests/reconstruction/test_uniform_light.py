@@ -266,7 +266,7 @@ def lowest(result):
 def test_the_start_is_worth_its_iterations(wide_capture, monkeypatch):
     """After 60 iterations E is 33 000 with it and 57 000 without; the minimum is 30 000."""
     better = solve(wide_capture)
-    monkeypatch.setattr(methods, "without_uniform_light", lambda problem: None)
+    monkeypatch.setattr(uniform_light, "without_uniform_light", lambda problem: None)
     plain = solve(wide_capture)
     assert lowest(better) < 0.7 * lowest(plain)
     truth = scenes.blocks(WIDE, seed=5, count=9)
@@ -303,7 +303,7 @@ def test_it_can_end_in_the_first_part(wide_capture, ending):
         return images[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "with_uniform_light", noted)
+        patch.setattr(uniform_light, "with_uniform_light", noted)
         result = solve(wide_capture, callback=end)
     assert (result.status, result.iterations) == (ending, 20)
     assert [p.iteration for p in result.history] == [0, 10, 20]
@@ -332,7 +332,7 @@ def test_a_first_part_that_converges_leaves_more_to_the_second(monkeypatch):
 def test_what_has_no_first_part(wide_capture, monkeypatch):
     """Few iterations, a start that is given, and other methods; none is longer than asked."""
     asked = []
-    monkeypatch.setattr(methods, "without_uniform_light", asked.append)
+    monkeypatch.setattr(uniform_light, "without_uniform_light", asked.append)
     for iterations in (1, 10):
         assert solve(wide_capture, iterations=iterations).iterations == iterations
     solve(wide_capture, iterations=20, start=jnp.ones(WIDE))
