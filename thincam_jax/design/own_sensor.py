@@ -10,7 +10,7 @@ import numpy as np
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
-from thincam_jax._core.precision import allow, decimal_value
+from thincam_jax._core.precision import allow, cast, decimal_value
 from thincam_jax._core.quantity import quantity
 from thincam_jax._core.table import Table
 from thincam_jax.design.design import Design, shots
@@ -117,24 +117,14 @@ def for_sensor(
         raise ValueError(
             f"distance = {distance}: give the least and the most in mm, such as (3, 10)"
         )
-    pitch = float(decimal_value(sensor.pitch))
+    given = sensor.pitch, object_distance, object_width, wavelength
+    pitch, far, across, light = (float(decimal_value(length)) for length in given)
     width = min(sensor.shape) * pitch
     with allow("float64"):
-        setup = Setup(
-            pitch,
-            width,
-            float(object_distance),
-            float(object_width),
-            noise=noise,
-            prior=PowerLaw(2.8),
-        )
-        usual = shots(
-            _BETAS,
-            min(max(_DISTANCE, nearest), farthest),
-            _PHASES,
-            wavelength=float(np.asarray(wavelength)),
-            width=width,
-        )
+        setup = Setup(pitch, width, far, across, noise=noise, prior=PowerLaw(2.8))
+        setup = cast(setup, "float64")
+        start = min(max(_DISTANCE, nearest), farthest)
+        usual = shots(_BETAS, start, _PHASES, wavelength=light, width=width)
         betas = beta_bounds(pitch, width)
         space = DesignSpace(
             usual,
