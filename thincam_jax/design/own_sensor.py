@@ -144,12 +144,12 @@ def for_sensor(
 def _searched(problem: DesignProblem) -> SensorDesign:
     space, key = problem.space, jax.random.key(0)
     given = problem.objective, space, problem.data
-    points, costs = sampled(*given, _SAMPLES, key)
-    near = points[jnp.argsort(costs)[:_BEST]]
+    points, costs = map(np.asarray, sampled(*given, _SAMPLES, key))
+    near = points[np.argsort(costs)[:_BEST]]
     low, high = near.min(axis=0), near.max(axis=0)
     finer = low + (high - low) * points
     every = np.concatenate([points, finer])
-    known = np.concatenate([costs, evaluate(*given, finer)])
+    known = np.concatenate([costs, evaluate(*given, jnp.asarray(finer))])
     starts = every[best_apart(every, known, _STARTS)]
     better, more = improved(problem, starts[::-1], ["iterations_exhausted"] * (_STARTS - 1))
     best, count = min(better, key=lambda one: one.objective), len(every) + more

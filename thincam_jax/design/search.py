@@ -295,7 +295,9 @@ def evaluate(
         more = -len(points) % at_a_time
         whole = jnp.asarray(np.pad(np.asarray(points), ((0, more), (0, 0)), "edge"))
         return _evaluate(objective, space, data, whole, at_a_time)[: len(points)]
-    return jnp.asarray(np.stack([_value(objective, space, data, point) for point in points]))
+    # Parts of a JAX array would be programs of their own.
+    each = [_value(objective, space, data, point) for point in np.asarray(points)]
+    return jnp.asarray(np.stack(each))
 
 
 @functools.partial(jax.jit, static_argnames="objective")
