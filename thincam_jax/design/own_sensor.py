@@ -26,7 +26,7 @@ from thincam_jax.reconstruction.synthesis import phase_pairs
 _BETAS, _DISTANCE, _LIGHT, _PHASES = (25.0, 21.0), 6.5, 500e-6, (0.0, 1.5 * math.pi)
 # Frequencies along an axis to sample and to improve; samples of either round, and the best of the
 # first, which bound the second; starts; step along a plateau, as a part of the bounds.
-_COARSE, _FINE, _SAMPLES, _BEST, _STARTS, _STEP = 128, 256, 512, 32, 4, 1 / 512
+_COARSE, _FINE, _SAMPLES, _BEST, _STARTS, _STEP = 128, 256, 256, 32, 4, 1 / 512
 PLATEAU_DB = 0.1
 
 
