@@ -77,7 +77,7 @@ def beta_bounds(pitch: float, width: float) -> tuple[float, float]:
 @checked
 def for_sensor(
     sensor: Sensor,
-    distance: tuple[float, float] = (3.0, 10.0),
+    distance: tuple[float | int, float | int] = (3.0, 10.0),
     *,
     object_distance: Annotated[Number, quantity("mm", positive=True)] = 250.0,
     object_width: Annotated[Number, quantity("mm", positive=True)] = 180.0,
@@ -112,7 +112,7 @@ def for_sensor(
 
     **See also**: `find_designs`, `DesignSpace`.
     """
-    nearest, farthest = distance
+    nearest, farthest = map(float, distance)
     if not 0 < nearest < farthest < math.inf:
         raise ValueError(
             f"distance = {distance}: give the least and the most in mm, such as (3, 10)"
