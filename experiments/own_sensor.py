@@ -15,6 +15,7 @@ from pathlib import Path
 
 import jax
 import matplotlib.pyplot as plt
+import numpy as np
 
 import thincam_jax as tc
 from thincam_jax.units import um
@@ -48,12 +49,18 @@ figure.savefig(FIGURES / "landscape.png", dpi=100)
 plt.show()
 
 # %%
-# The cameras
-# -----------
+# The masks
+# ---------
 #
-# One of each capture, to simulate what is found: the expected error knows nothing of a
+# The first mask of each pitch. Simulate what is found, for the expected error knows nothing of a
 # reconstruction that suffers at the sensor's border. ``thincam init design --sensor 1500x2000
 # --pitch 3.45um`` writes a file that does all of it.
 
-for camera in found.best.design.cameras(sensor):
-    print(camera)
+figure, panels = plt.subplots(2, 1, figsize=(7.6, 5.0), layout="constrained", squeeze=False)
+for panel, camera in zip(panels[:, 0], found.best.design.cameras(sensor)[::2], strict=True):
+    beta, width = float(camera.mask.beta), float(camera.mask.width)
+    x = np.linspace(-width / 2, width / 2, 2001)
+    panel.plot(x, (1 + np.cos(beta * x**2)) / 2)
+    panel.set(xlabel="x on the mask, mm", ylabel="transmission", title=f"{beta:.2f} rad/mm²")
+figure.savefig(FIGURES / "masks.png", dpi=100)
+plt.show()
