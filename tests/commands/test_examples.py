@@ -111,3 +111,37 @@ def test_a_list_tells_examples_from_kinds(tmp_path):
     assert {row[1] for row in shown["rows"]} == set(kinds.KINDS)
     assert ["screen", "screen"] in [row[:2] for row in shown["rows"]]
     assert call("init", "sts_camera", "--out", tmp_path).exit_code == 0
+
+
+def test_a_design_for_an_own_sensor(tmp_path):
+    path = tmp_path / "own.yaml"
+    given = ("init", "design", "--sensor", "1200x1600", "--pitch", "2 um", "--out", path)
+    assert call(*given).exit_code == 0
+    config = load_experiment(path, command="design")
+    assert config.sensor.shape == (1200, 1600)
+    assert config.sensor.pitch == pytest.approx(0.002)
+    assert config.mask.width == pytest.approx(2.4)
+    low, high = config.search.free[0].bounds
+    assert low == pytest.approx(16 * 3.14159 / 2.4**2, rel=1e-3)
+    assert high == pytest.approx(3.14159 / (0.002 * 2.4), rel=1e-3)
+    assert config.search.frequencies.exact == 256
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (("design", "--sensor", "1500", "--pitch", "3um"), "give rows and columns, as --sensor 15"),
+        (("design", "--pitch", "3um"), "give rows and columns, as --sensor 1500x2000"),
+        (("design", "--sensor", "1500x2000"), "write a length such as"),
+        (("design", "--sensor", "0x20", "--pitch", "3um"), "shape"),
+        (("study", "--pitch", "3um"), "are for a design: thincam init design"),
+    ],
+)
+def test_a_sensor_that_is_none(given, told, tmp_path):
+    path = tmp_path / "own.yaml"
+    assert told in one_line(call("init", *given, "--out", path))
+    assert not path.exists()
+    # As it was advised.
+    assert (
+        call("init", "design", "--sensor", "15x20", "--pitch", "3um", "--out", path).exit_code == 0
+    )

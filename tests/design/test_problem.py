@@ -82,3 +82,24 @@ def test_best_data_are_the_exact_ones():
     problem = small.problem()
     assert problem.best_data is problem.exact
     assert dataclasses.replace(problem, exact=None).best_data is problem.data
+
+
+def test_frequencies_stay_few_however_many_fringes_a_sensor_has():
+    """Close at zero, farther apart above: the errors of even samples, to 0.01 dB."""
+    space = DesignSpace(small.pairs(), (small.shared("width", 2.0, 120.0, 0),))
+    many = design_problem(BayesError(), space, small.setup(), phase_pairs(2))
+    axis = np.asarray(many.exact.frequencies.axis)
+    assert len(axis) == 384
+    needed = int(np.ceil(2.2 * 123.6 / 3 * 18.75)) + 1
+    assert axis[0] == 0 and axis[-1] == pytest.approx(18.75)
+    assert axis[1] == pytest.approx(18.75 / (needed - 1), rel=0.01)
+    assert np.all(np.diff(axis, 2) > -1e-6)
+    numbers = small.setup(), jnp.asarray(phase_pairs(2))
+    even, few = Quadrant(18.75, 1400), Quadrant(18.75, 128, 640)
+    for betas, width in (((25.0, 21.0), 2.0), ((14.0, 29.0), 3.0)):
+        design = small.pairs(betas, width=width)
+        errors = [float(bayes_error(channels(design, *numbers, each))) for each in (even, few)]
+        assert 10 * np.log10(errors[1] / errors[0]) == pytest.approx(0, abs=0.01)
+    assert float(few.weight.sum()) == pytest.approx((2 * 18.75) ** 2)
+    ring = few.ring(8).reshape(128, 128)
+    np.testing.assert_array_equal(ring[0, :-1], np.floor(8 * few.axis[:-1] / 18.75))

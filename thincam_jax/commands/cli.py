@@ -116,7 +116,7 @@ app = typer.Typer(
 calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
 calibrate.callback()(lambda: None)
 for group, command, *examples in (
-    (app, init, "init study", "init design --out mine.yaml"),
+    (app, init, "init study", "init design --sensor 1500x2000 --pitch 3.45um --out mine.yaml"),
     (app, schema, "schema study > study.schema.json"),
     (app, explain, "explain study.yaml", "explain study.yaml --set noise.snr_db=40"),
     (app, explore, "explore study.yaml", "explore study.yaml --set mask.width=3mm --no-browser"),

@@ -194,6 +194,10 @@ def init(
         str | None, typer.Argument(help="Leave it out for a list of them.", autocompletion=examples)
     ] = None,
     out: Annotated[Path | None, typer.Option(help="File, or folder; default EXAMPLE.yaml.")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Pixels of your sensor, as 1500x2000; for 'design'.")
+    ] = None,
+    pitch: Annotated[str | None, typer.Option(help="Its pixel pitch, as 3.45um.")] = None,
 ) -> None:
     """Write an example experiment file to begin with; or list these."""
     with reported(lambda: "interrupted"):
@@ -213,8 +217,15 @@ def init(
             raise ConfigError(f"init {example}: choose one of {', '.join(examples())}")
         path = out or Path()
         path = path / f"{example}.yaml" if path.is_dir() else path
-        source = _source(example)
+        own = sensor is not None or pitch is not None
+        if own and example != "design":
+            raise ConfigError("--sensor and --pitch are for a design: thincam init design")
+        source = _source("design_sensor" if own else example)
         text, command = source.read_text(encoding="utf-8"), read_kind(source).command
+        if own:
+            from thincam_jax.commands.design.own_sensor import with_sensor
+
+            text = with_sensor(text, sensor or "", pitch or "")
         # A copy may lie anywhere; its schema stays with the package that reads it.
         text = text.replace("$schema=", f"$schema={_folder().as_uri()}/", 1)
         # One name for the file, the experiment and its run folder.

@@ -7,6 +7,7 @@ import contextlib
 import functools
 import re
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -174,7 +175,7 @@ def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
 @contextlib.contextmanager
 def counted(name: str) -> Iterator[Callable[[str, int], None]]:
     """A progress bar; what it yields is called at each step, with its text and their number."""
-    with progress_bar() as bar:
+    with progress_bar() as bar, lines_in_a_log(bar):
         task = bar.add_task(name, total=None)
 
         def begun(text: str, total: int) -> None:
@@ -182,3 +183,25 @@ def counted(name: str) -> Iterator[Callable[[str, int], None]]:
             bar.start()
 
         yield begun
+
+
+@contextlib.contextmanager
+def lines_in_a_log(bar: "rich.progress.Progress", every: float = 10.0) -> Iterator[None]:
+    """A line every ten seconds on standard error where a bar cannot move, as in a file."""
+    ended = threading.Event()
+
+    def lines() -> None:
+        while not ended.wait(every):
+            for task in bar.tasks:
+                tell(
+                    f"{task.description} ({task.completed:g} of {task.total or 0:g}), "
+                    f"{task.elapsed or 0:.0f} s"
+                )
+
+    thread = threading.Thread(target=lines, daemon=True)
+    if not bar.disable and not bar.console.is_terminal:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set()

@@ -9,6 +9,7 @@ from thincam_jax.design.layout import write_gds as write_gds
 from thincam_jax.design.match import ResponseModel as ResponseModel
 from thincam_jax.design.match import match_response as match_response
 from thincam_jax.design.objectives import BayesError as BayesError
+from thincam_jax.design.own_sensor import for_sensor as for_sensor
 from thincam_jax.design.problem import FrequencyCounts as FrequencyCounts
 from thincam_jax.design.problem import design_problem as design_problem
 from thincam_jax.design.search import SearchSettings as SearchSettings

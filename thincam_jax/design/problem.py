@@ -22,6 +22,8 @@ from thincam_jax.design.space import DesignSpace
 Objective = Callable[[Design, Any], Float[Array, ""]]
 
 _MARGIN, _FEWEST = 1.1, 128  # of the samples that fringes need; at least
+# Along an axis, of even samples; where more are needed, so many that are close at zero only.
+_MOST_EVEN, _GRADED = 1280, 384
 
 
 @checked
@@ -94,7 +96,8 @@ class DesignProblem(eqx.Module):
 class FrequencyCounts:
     """Sampling of responses: radii and directions in a search, the square of `exact`.
 
-    - `exact`: along each axis; None: as many as the fringes of the responses need.
+    - `exact`: along each axis, close at zero only where they are fewer than the fringes of the
+      responses need; None: as many as these need, or 384 where those would be too many.
     """
 
     radii: Annotated[int, whole(64, 8192)] = 1024
@@ -121,13 +124,14 @@ def design_problem(
     """
     counts = counts or FrequencyCounts()
     highest = jnp.asarray(space.reach("distance")[1] / (4 * float(setup.pitch)))
-    exact = counts.exact or _exact_count(space, setup, float(highest))
+    needed = _exact_count(space, setup, float(highest))
+    exact = counts.exact or (needed if needed <= _MOST_EVEN else _GRADED)
     matrix = jnp.asarray(synthesis, float)
     return DesignProblem(
         objective,
         space,
         ObjectiveData(setup, matrix, Polar(highest, counts.radii, counts.directions)),
-        ObjectiveData(setup, matrix, Quadrant(highest, exact)),
+        ObjectiveData(setup, matrix, Quadrant(highest, exact, needed)),
     )
 
 

@@ -127,7 +127,7 @@ def find_designs(
     if problem.exact is None or not search.found:
         return search
     begun = np.stack([*(one.point for one in search.found), points[chosen[0]]])
-    better, more = _improved(problem, begun, [one.status for one in search.found])
+    better, more = improved(problem, begun, [one.status for one in search.found])
     found = without_repeats(better, settings.separation)
     return Search(found, search.evaluations + more, search.failed)
 
@@ -161,9 +161,14 @@ def random_search(
     An evaluation of a descent counts as three, for its gradient. The samples that are best by the
     problem's data are ranked by its exact ones, where it has them.
     """
-    key = random_key(key)
-    space, batch = problem.space, max(settings.samples, settings.starts)
+    batch = max(settings.samples, settings.starts)
     count = batch + _GRADIENT * max(search.evaluations - batch, 0)
+    return best_random(problem, count, batch, random_key(key)), count
+
+
+def best_random(problem: DesignProblem, count: int, batch: int, key: PRNGKeyArray) -> Design:
+    """The best of so many random designs, evaluated in batches, as of `random_search`."""
+    space = problem.space
     every = jax.random.uniform(key, (count, space.size), space.lower.dtype)
     # In parts as large as the search's samples, whose program they share.
     whole = jnp.pad(every, ((0, -count % batch), (0, 0)), "edge").reshape(-1, batch, space.size)
@@ -173,7 +178,7 @@ def random_search(
     if problem.exact is not None:
         exact = evaluate(problem.objective, space, problem.exact, best, at_a_time=1)
         best = best[np.argsort(np.asarray(exact))]
-    return space.design(best[0]), count
+    return space.design(best[0])
 
 
 # How many optima are improved on the exact objective, and how: from the best of so many even
@@ -184,10 +189,10 @@ _IMPROVED, _TRIED, _NEAR = 3, 32, 0.1
 _SIDE, _LEAST_STEP, _LEAST_GAIN, _MOST = 0.02, 1e-3, 1e-5, 50
 
 
-def _improved(
+def improved(
     problem: DesignProblem, starts: np.ndarray, statuses: list[Status]
 ) -> tuple[list[Found], int]:
-    """The last start and the best of the others improved, the others as they are; evaluations.
+    """The last start and the best three others improved, the rest as they are; evaluations.
 
     Without the gradient: an evaluation is costly, its gradient costs more to compile than all.
     """
@@ -290,7 +295,9 @@ def evaluate(
         more = -len(points) % at_a_time
         whole = jnp.asarray(np.pad(np.asarray(points), ((0, more), (0, 0)), "edge"))
         return _evaluate(objective, space, data, whole, at_a_time)[: len(points)]
-    return jnp.asarray(np.stack([_value(objective, space, data, point) for point in points]))
+    # Parts of a JAX array would be programs of their own.
+    each = [_value(objective, space, data, point) for point in np.asarray(points)]
+    return jnp.asarray(np.stack(each))
 
 
 @functools.partial(jax.jit, static_argnames="objective")

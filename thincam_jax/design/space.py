@@ -172,13 +172,17 @@ class DesignSpace(eqx.Module):
 
         Of a number that captures share, the first one's counts.
         """
+        spans = self.highest(design.width) - self.lower
+        inside = (self.numbers(design) - self.lower) / jnp.where(spans > 0, spans, 1)
+        return jnp.where(spans > 0, inside, 0.5)
+
+    def numbers(self, design: Design) -> Float[Array, " variable"]:
+        """The free numbers of a design, of any space."""
         given = [
             getattr(design, v.name)[v.captures[0]] if v.captures else design.width
             for v in self.variables
         ]
-        spans = self.highest(design.width) - self.lower
-        inside = (jnp.stack(given) - self.lower) / jnp.where(spans > 0, spans, 1)
-        return jnp.where(spans > 0, inside, 0.5)
+        return jnp.stack(given)
 
     def highest(self, width: Float[Array, ""]) -> Float[Array, " variable"]:
         """The upper bounds of the free numbers of designs with masks of a width, mm."""
