@@ -77,8 +77,8 @@ def beta_bounds(pitch: float, width: float) -> tuple[float, float]:
 @checked
 def for_sensor(
     sensor: Sensor,
-    distance: tuple[float | int, float | int] = (3.0, 10.0),
     *,
+    distance: tuple[float | int, float | int] = (3.0, 10.0),
     object_distance: Annotated[Number, quantity("mm", positive=True)] = 250.0,
     object_width: Annotated[Number, quantity("mm", positive=True)] = 180.0,
     noise: SignalNoise | PhotonNoise | None = None,
