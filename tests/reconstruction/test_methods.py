@@ -355,6 +355,7 @@ def test_what_is_out_of_range_is_refused(kind):
         (jnp.ones((3, 20, 21)), r"start has shape \(3, 20, 21\); give an image"),
         (jnp.ones((40, 41)), "start has 40×41 pixels, more than the field's"),
         (jnp.ones(7), r"start has shape \(7,\)"),
+        (0, r"start has shape \(\); give an image"),
     ):
         rig.refused(message, lambda s=start: tc.reconstruct(psf, kind(), start=s))
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.grids import same_parity
 from thincam_jax.imaging.operators.crop_convolution import middle_corner, place
 from thincam_jax.reconstruction.coarse import coarsened
@@ -115,7 +116,12 @@ def beyond_field(
 def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recording:
     """A recording whose field holds the start image; a field that is given stays."""
     model = recording.imaging_model
-    if start is None or start.ndim < 2 or not isinstance(model, Cameras):
+    if start is None:
+        return recording
+    start = checks.array("start", start)
+    if start.ndim < 2:
+        raise ValueError(f"start has shape {start.shape}; give an image, its rows and columns last")
+    if not isinstance(model, Cameras):
         return recording
     (rows, columns), given = model.cameras[0].sensor.shape, start.shape[-2:]
     if model.pixels is not None or (given[0] <= rows and given[1] <= columns):
