@@ -23,7 +23,7 @@ def test_bounds_are_two_zones_and_two_pixels_a_period():
 @pytest.mark.parametrize("given", [(10.0, 3.0), (0.0, 3.0), (3.0, float("inf"))])
 def test_distances_that_cross_are_refused(given):
     with pytest.raises(ValueError, match=r"give the least and the most in mm, such as \(3, 10\)"):
-        tc.design.for_sensor(tc.Sensor((12, 16), 100 * um), given)
+        tc.design.for_sensor(tc.Sensor((12, 16), 100 * um), distance=given)
 
 
 @pytest.mark.thorough

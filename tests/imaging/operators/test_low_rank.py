@@ -75,6 +75,8 @@ def test_measured_positions():
         np.testing.assert_allclose(seen(row, column), whole, atol=1e-9)
     with pytest.raises(ValueError, match="give 3 rows and 4 columns of the field, increasing"):
         low_rank_psf(psfs, PITCH, SENSOR, FIELD, tolerance=0.1, positions=(columns, rows))
+    with pytest.raises(ValueError, match=r"field_shape = \(1, 9\) has one line .* give 2×2"):
+        low_rank_psf(psfs, PITCH, SENSOR, (1, 9), tolerance=0.1)
 
 
 def test_even_psfs_are_centred_on_their_middle_pixel():

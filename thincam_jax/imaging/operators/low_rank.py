@@ -228,6 +228,10 @@ def principal_psfs(
 def _places(positions, points, field_shape) -> list[np.ndarray]:
     """Rows and columns of the grid's points on the field."""
     if positions is None:
+        if min(field_shape) < 2:
+            raise ValueError(
+                f"field_shape = {field_shape} has one line for several PSFs; give 2×2 or more"
+            )
         pairs = zip(field_shape, points, strict=True)
         return [np.linspace(0, n - 1, count) for n, count in pairs]
     both = positions if isinstance(positions, tuple | list) else [positions]
