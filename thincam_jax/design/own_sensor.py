@@ -11,6 +11,7 @@ import numpy as np
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import allow, cast, decimal_value
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity
 from thincam_jax._core.table import Table
 from thincam_jax.design.design import Design, shots
@@ -75,6 +76,7 @@ def beta_bounds(pitch: float, width: float) -> tuple[float, float]:
 
 
 @checked
+@watched("designing")
 def for_sensor(
     sensor: Sensor,
     *,
