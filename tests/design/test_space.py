@@ -180,3 +180,7 @@ def test_active_limits_in_words():
 def test_refused(variables, limits, message):
     with pytest.raises(ValueError, match=message):
         DesignSpace(BASE, variables, limits)
+
+
+def test_captures_may_come_as_an_array():
+    assert Variable("beta", 8.0, 9.0, np.array([0, 1])).captures == (0, 1)

@@ -84,6 +84,9 @@ class Variable:
     upper: float
     captures: tuple[int, ...] = ()
 
+    def __post_init__(self):
+        object.__setattr__(self, "captures", tuple(map(int, self.captures)))
+
     @property
     def unit(self) -> str:
         """Unit of the variable's values."""

@@ -246,8 +246,8 @@ def given_variances(
     known = 0 if checks.is_traced(each) else each
     if not np.all((known >= 0) & np.isfinite(known)):
         raise ValueError(
-            f"noise_variance = {noise_variance} is negative or not finite; give variances in the "
-            "captures' units squared, or none to have them estimated"
+            f"noise_variance = {checks.shown(noise_variance)} is negative or not finite; give "
+            "variances in the captures' units squared, or none to have them estimated"
         )
     if each.ndim and each.shape[0] != count:
         raise ValueError(
