@@ -79,8 +79,8 @@ def machine_report() -> list[str]:
 
 def verdict() -> list[str]:
     """Lines that say what can be done here, and what to install for the rest."""
-    absent = [name for name in PACKAGES if name not in installed(PACKAGES)]
-    wrong = [f"{name} is not installed" for name in absent]
+    there = installed(PACKAGES)
+    wrong = [f"{name} is not installed" for name in PACKAGES if name not in there]
     if (sums := compiled_sums()) != "right":
         wrong.append(f"compiled sums are {sums}")
     lacking = {extra: missing for extra in EXTRAS if (missing := missing_packages(extra))}
@@ -97,14 +97,17 @@ def verdict() -> list[str]:
 
 def missing_packages(extra: str) -> list[str]:
     """The packages of an extra that are not installed."""
-    chosen = {"extra": extra}
-    needed = [Requirement(text) for text in metadata.requires("thincam_jax") or ()]
-    needed = [r for r in needed if r.marker and not r.marker.evaluate({"extra": ""})]
     found: list[str] = []
-    for one in needed:
-        if one.marker is not None and one.marker.evaluate(chosen):
-            inner = [name for other in one.extras for name in missing_packages(other)]
-            found += inner if one.extras else [one.name] if not installed([one.name]) else []
+    for one in map(Requirement, metadata.requires("thincam_jax") or ()):
+        with_it, without = (
+            one.marker is None or one.marker.evaluate({"extra": name}) for name in (extra, "")
+        )
+        if without or not with_it:
+            continue
+        if one.extras:
+            found += [name for other in sorted(one.extras) for name in missing_packages(other)]
+        elif not installed([one.name]):
+            found.append(one.name)
     return found
 
 

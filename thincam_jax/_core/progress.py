@@ -28,17 +28,32 @@ def watched(what: str) -> Iterator[Callable[[int, int], None]]:
     if _is_watched.get() or os.environ.get("THINCAM_PROGRESS") == "off":
         yield lambda step, most: None
         return
-    line, over = _Line(what), threading.Event()
-    speaker = threading.Thread(target=line.repeat, args=(over,), daemon=True)
-    token = _is_watched.set(True)
-    speaker.start()
+    line, token = _Line(what), _is_watched.set(True)
     try:
-        yield line.tell
+        with repeating(line.say, _PATIENCE if line.is_live else _SELDOM):
+            yield line.tell
     finally:
         _is_watched.reset(token)
+        line.show("")
+
+
+@contextlib.contextmanager
+def repeating(say: Callable[[], float], pause: float) -> Iterator[None]:
+    """Call a function in a thread after a pause, s, and again after each pause that it returns."""
+    over = threading.Event()
+
+    def repeat() -> None:
+        wait = pause
+        while not over.wait(wait):
+            wait = say()
+
+    speaker = threading.Thread(target=repeat, daemon=True)
+    speaker.start()
+    try:
+        yield
+    finally:
         over.set()
         speaker.join()
-        line.show("")
 
 
 class _Line:
@@ -55,14 +70,13 @@ class _Line:
         self.now = (step, most)
         self.first = self.first or (step, time.monotonic())
 
-    def repeat(self, over: threading.Event) -> None:
-        pause = _PATIENCE if self.is_live else _SELDOM
-        while not over.wait(pause):
-            if self.is_live:
-                self.show(str(self))
-                pause = _OFTEN
-            else:
-                logging.getLogger(__name__).info("%s", self)
+    def say(self) -> float:
+        """Show or log the line; seconds until the next one."""
+        if self.is_live:
+            self.show(str(self))
+            return _OFTEN
+        logging.getLogger(__name__).info("%s", self)
+        return _SELDOM
 
     def show(self, text: str) -> None:
         """Write the text over the one before; nothing over nothing."""

@@ -7,7 +7,6 @@ import contextlib
 import functools
 import re
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from thincam_jax._core.progress import repeating
 from thincam_jax._core.text import escaped
 from thincam_jax.commands.interrupt import INTERRUPTED, interruptible
 
@@ -188,20 +188,15 @@ def counted(name: str) -> Iterator[Callable[[str, int], None]]:
 @contextlib.contextmanager
 def lines_in_a_log(bar: "rich.progress.Progress", every: float = 10.0) -> Iterator[None]:
     """A line every ten seconds on standard error where a bar cannot move, as in a file."""
-    ended = threading.Event()
 
-    def lines() -> None:
-        while not ended.wait(every):
-            for task in bar.tasks:
-                tell(
-                    f"{task.description} ({task.completed:g} of {task.total or 0:g}), "
-                    f"{task.elapsed or 0:.0f} s"
-                )
+    def say_all() -> float:
+        for task in bar.tasks:
+            tell(
+                f"{task.description} ({task.completed:g} of {task.total or 0:g}), "
+                f"{task.elapsed or 0:.0f} s"
+            )
+        return every
 
-    thread = threading.Thread(target=lines, daemon=True)
-    if not bar.disable and not bar.console.is_terminal:
-        thread.start()
-    try:
+    is_still = not bar.disable and not bar.console.is_terminal
+    with repeating(say_all, every) if is_still else contextlib.nullcontext():
         yield
-    finally:
-        ended.set()

@@ -327,13 +327,14 @@ class Recording(Module):
         """Not negative but in differences of captures, and if something was subtracted before."""
         if self.background is not None or isinstance(self.imaging_model, Stacked):
             return "known"
+        if not nonnegative or (synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))):
+            return "unknown"
         # Where it leaves the brightness open, a negative background is far worse than none.
         is_open = isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None
         known = [c for c in captures if not checks.is_traced(c)]
         with jax.ensure_compile_time_eval():  # captures that are known stay so under jit
             below = any(is_below_black(c, by_noise=is_open) for c in known)
-        mixed = synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))
-        return "nonnegative" if nonnegative and not (below or mixed) else "unknown"
+        return "unknown" if below else "nonnegative"
 
     @property
     def is_above_black(self) -> bool:

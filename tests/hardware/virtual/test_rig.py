@@ -250,7 +250,7 @@ def without_libraries(monkeypatch):
 
 
 def test_without_its_library_a_plain_device_gives_the_same_frames(monkeypatch, caplog):
-    """The extra that brings the protocol is told."""
+    """A warning names the extra that brings the protocol."""
     frames = []
     for is_missing in (False, True):
         with VirtualDevices(rig()) as devices:

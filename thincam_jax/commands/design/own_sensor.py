@@ -17,11 +17,12 @@ def with_sensor(text: str, shape: str, pitch: str) -> str:
     if sides is None:
         raise ConfigError(f"--sensor {shape!r}: give rows and columns, as --sensor 1500x2000")
     try:
-        sensor = Sensor((int(sides[1]), int(sides[2])), parse_quantity(pitch, "length"))
+        length = parse_quantity(pitch, "length")
+        sensor = Sensor((int(sides[1]), int(sides[2])), length)
     except ValueError as error:
         raise ConfigError(f"--sensor {shape} --pitch {pitch!r}: {error}") from None
-    width = min(sensor.shape) * parse_quantity(pitch, "length")
-    low, high = beta_bounds(width / min(sensor.shape), width)
+    width = min(sensor.shape) * length
+    low, high = beta_bounds(length, width)
     for found, given in (
         (r"(?<=\n  shape: ).*", str(list(sensor.shape))),
         (r"(?<=\n  pitch: ).*", pitch),
