@@ -122,7 +122,7 @@ MODULES = (
     "learn.refocusing.use",
     "learn.training",
     "lensless.masks.display",
-    "lensless.masks.reliefs",
+    "lensless.masks.phase",
     "lensless.phase_shift",
     "lensless.propagation.angular_spectrum",
     "measured.bayer",

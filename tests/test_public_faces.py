@@ -25,7 +25,7 @@ MODULES = (
     *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
     *("waveguide.design.plate", "design.ranking", "design.sensitivity"),
     *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
-    "lensless.masks.reliefs",
+    "lensless.masks.phase",
     *("waveguide.measured.screen_fit", "measured.exposures", "measured.sensor"),
     *("reconstruction.depth.find", "reconstruction.problem"),
     *("studies.evaluate", "studies.prepared", "hardware.studies.images", "waveguide.distance"),

@@ -17,7 +17,7 @@ from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import run_study
-from thincam_jax.lensless.light import fall_of_light
+from thincam_jax.lensless.field import fall_of_light
 from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.studies import Method, Target
 from thincam_jax.studies.evaluate import coupled, field_shape, reconstructor

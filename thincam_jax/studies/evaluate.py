@@ -20,8 +20,7 @@ from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless.exposures import Exposure
-from thincam_jax.lensless.field import tangents_of
-from thincam_jax.lensless.light import light_over_field
+from thincam_jax.lensless.field import light_over_field, tangents_of
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.methods import AdmmTV, reconstruct

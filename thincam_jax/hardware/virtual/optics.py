@@ -28,8 +28,7 @@ from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.sampled import SampledMask
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable import pixel_nodes
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
 from thincam_jax.measured.bayer import Pattern, mosaic
 from thincam_jax.measured.calibration.alignment import to_indices
 
