@@ -99,7 +99,7 @@ MODULES = (
     "hardware.acquisition.plan",
     "hardware.acquisition.taker",
     "hardware.base",
-    "hardware.displays.phase_levels",
+    "hardware.displays.levels",
     "hardware.virtual.optics",
     "hardware.virtual.rig",
     "imaging.metrics.mtf",
