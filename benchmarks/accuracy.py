@@ -42,8 +42,7 @@ from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.resolve import psf_cost
 from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
-from thincam_jax.studies.simulate import stacked, take
+from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor, stacked, take
 from thincam_jax.studies.study import Method, Study, Target
 
 SIZES, CAPTURE_SIZE = (128, 256, 512), 256  # and the sensor's own, where it is smaller

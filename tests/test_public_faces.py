@@ -29,7 +29,7 @@ MODULES = (
     *("waveguide.measured.screen_fit", "measured.exposures", "measured.sensor"),
     *("reconstruction.depth.find", "reconstruction.problem"),
     *("studies.evaluate", "studies.prepared", "hardware.studies.images", "waveguide.distance"),
-    *("studies.response", "studies.study", "waveguide.colours"),
+    *("studies.result", "studies.study", "waveguide.colours"),
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.

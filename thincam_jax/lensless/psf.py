@@ -193,7 +193,7 @@ def mtf(
     print(contrast.shape)  # (2,)
     ```
 
-    **See also**: `otf`, `plot.otf`, `design.transfer.modulation_transfer`.
+    **See also**: `otf`, `plot.otf`, `design.ranking.modulation_transfer`.
     """
     grid = camera.sensor.grid
     given = jnp.linspace(0.0, 0.5, 64) / grid.pitch if frequencies is None else frequencies
