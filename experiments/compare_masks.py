@@ -22,7 +22,7 @@ from thincam_jax.imaging.targets import middle_square, sample_image
 from thincam_jax.imaging.targets.patterns import point_grid
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence, random_cells
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": large pixels, in seconds

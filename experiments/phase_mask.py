@@ -33,7 +33,7 @@ from thincam_jax.imaging.refractive_index import CauchyIndex, ConstantIndex
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.masks import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds

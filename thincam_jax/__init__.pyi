@@ -1,5 +1,8 @@
 """The names of `thincam_jax`; `__init__.py` reads them from here."""
 
+from thincam_jax.lensless.masks.pinhole import LensletArray as LensletArray
+from thincam_jax.lensless.masks.redundant_arrays import SeparableMask as SeparableMask
+
 from . import design as design
 from . import hardware as hardware
 from . import imaging as imaging
@@ -27,9 +30,7 @@ from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.exposures import Exposures as Exposures
 from .lensless.field import field_operator as field_operator
-from .lensless.masks.cells import SeparableMask as SeparableMask
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
-from .lensless.masks.lenslets import LensletArray as LensletArray
 from .lensless.masks.phase import PhaseMask as PhaseMask
 from .lensless.masks.pinhole import Pinhole as Pinhole
 from .lensless.masks.pinhole import RadialMask as RadialMask

@@ -8,9 +8,9 @@ from design.setting import HIGHEST, WAVELENGTH, setup, thesis_design
 
 from helpers import relative_l2
 from thincam_jax.design import Polar, PowerLaw
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import bayes_error, channels, ring_means
 from thincam_jax.design.response import responses, seen_part
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors

@@ -11,8 +11,8 @@ import pytest
 import thincam_jax as tc
 from thincam_jax.design import PhotonNoise, Polar, PowerLaw, Setup, SignalNoise
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.response import capture_light, responses, signal_variance, spectral_density
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.lensless.exposures import Exposures
 
 respond = jax.jit(responses)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from thincam_jax.hardware.errors import Busy
+from thincam_jax.hardware.base import Busy
 from thincam_jax.hardware.holder import held, holder
 
 HOLD = """\

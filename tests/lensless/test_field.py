@@ -9,9 +9,8 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
-from thincam_jax.lensless.field import tangents_of
+from thincam_jax.lensless.field import fall_of_light, tangents_of
 from thincam_jax.lensless.forward import imaging_operator
-from thincam_jax.lensless.light import fall_of_light
 from thincam_jax.lensless.psf import psf_about_ray
 from thincam_jax.units import nm, um
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.ndimage
 
 from thincam_jax.measured import Raw, prepare
-from thincam_jax.measured.dark import find_levels
+from thincam_jax.measured.merging import find_levels
 
 SHAPE, BLACK = (48, 64), 64
 

@@ -9,7 +9,7 @@ import thincam_jax as tc
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
 from thincam_jax.plot.studies import _by_synthesis, enlarged_part
-from thincam_jax.studies.response import Response, ResponseLimits
+from thincam_jax.studies.result import Response, ResponseLimits
 
 
 def test_the_detail_of_a_chart_holds_its_fine_groups():

@@ -8,10 +8,14 @@ import scipy.stats
 from studies import tiny
 
 import thincam_jax as tc
-from thincam_jax.studies import held_out as module
-from thincam_jax.studies.held_out import GainOverPhotographs, further_photographs, hold_out
+from thincam_jax.studies import trials as module
 from thincam_jax.studies.study import Target
-from thincam_jax.studies.trials import simulate_trials
+from thincam_jax.studies.trials import (
+    GainOverPhotographs,
+    further_photographs,
+    hold_out,
+    simulate_trials,
+)
 
 
 def test_the_interval_is_that_of_the_mean():

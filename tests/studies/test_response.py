@@ -6,7 +6,7 @@ from studies import tiny
 
 import thincam_jax as tc
 from thincam_jax.studies import Method
-from thincam_jax.studies.response import method_response
+from thincam_jax.studies.result import method_response
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.sampling import require_phase_sampling
+from thincam_jax.lensless.resolve import require_phase_sampling
 
 # Of the angle u, whose range from the lowest to the highest relief is π/2.
 _RATE = 0.05

@@ -17,8 +17,7 @@ from thincam_jax.plot.frame import drawing, line_style
 if TYPE_CHECKING:
     from thincam_jax.design.design import Shot
     from thincam_jax.design.landscape import Landscape
-    from thincam_jax.design.ranking import RankedDesign
-    from thincam_jax.design.transfer import ModulationTransfer
+    from thincam_jax.design.ranking import ModulationTransfer, RankedDesign
     from thincam_jax.studies.design import FoundDesigns
     from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores
     from thincam_jax.studies.study import Study

@@ -41,8 +41,15 @@ from thincam_jax.reconstruction.depth.refocus import (
     refocus_distances,
 )
 from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.studies.evaluate import reconstructor, rounded, sample
-from thincam_jax.studies.simulate import Capture, expose, noise_free, stacked
+from thincam_jax.studies.evaluate import (
+    Capture,
+    expose,
+    noise_free,
+    reconstructor,
+    rounded,
+    sample,
+    stacked,
+)
 from thincam_jax.studies.study import Method, Study, Target
 
 if TYPE_CHECKING:

@@ -23,8 +23,7 @@ from thincam_jax.design.search import Search
 from thincam_jax.imaging.sensor import electrons_per_unit
 from thincam_jax.studies import design as designs
 from thincam_jax.studies.design_scores import DesignScores
-from thincam_jax.studies.evaluate import evaluate_method
-from thincam_jax.studies.simulate import noise_free, take
+from thincam_jax.studies.evaluate import evaluate_method, noise_free, take
 from thincam_jax.studies.trials import Spread
 
 QUICK = ("search.starts=2", "search.samples=8", "search.steps=3")

@@ -13,7 +13,7 @@ from hardware.commands import tiny
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.hardware.commands.command import build_plan
 from thincam_jax.hardware.commands.config import CaptureConfig
-from thincam_jax.hardware.displays.grey_levels import GreyLevels
+from thincam_jax.hardware.displays.levels import GreyLevels
 
 SCENE = yaml.safe_load(tiny.METHOD_B)
 SCENE["camera"]["exposure"] = "5 ms"

@@ -10,7 +10,7 @@ from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition.acquire import acquire
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, linear_levels, measured_levels
+from thincam_jax.hardware.displays.levels import GreyLevels, linear_levels, measured_levels
 from thincam_jax.hardware.displays.patterns import pattern_levels
 from thincam_jax.hardware.plans import grey_levels
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.units import nm, um
 
 LIGHT = 532 * nm

@@ -6,8 +6,7 @@ import threading
 import pytest
 from stage_faults import STAGES
 
-from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import Busy, NotHomed, OutOfRange, ProtocolError, Timeout
+from thincam_jax.hardware.base import Busy, Identity, NotHomed, OutOfRange, ProtocolError, Timeout
 from thincam_jax.hardware.registry import open_device
 from thincam_jax.hardware.stages import serial_stage
 from thincam_jax.hardware.virtual.grbl import PULL_OFF

@@ -2,7 +2,7 @@
 
 import pytest
 
-from thincam_jax.hardware.errors import ProtocolError, Timeout
+from thincam_jax.hardware.base import ProtocolError, Timeout
 from thincam_jax.hardware.stages.zaber import ZaberMessage, ZaberStage, checksum, parse_message
 from thincam_jax.hardware.virtual.serial_device import Motion
 from thincam_jax.hardware.virtual.zaber import MICROSTEP, VirtualZaber, parse_command

@@ -12,7 +12,7 @@ from thincam_jax.hardware.studies.images import frame_solver, live_image
 from thincam_jax.hardware.studies.rig import scenes_of
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.measured.bayer import mosaic, shifted_pattern
-from thincam_jax.studies.simulate import noise_free
+from thincam_jax.studies.evaluate import noise_free
 from thincam_jax.studies.study import Method
 from thincam_jax.units import nm
 

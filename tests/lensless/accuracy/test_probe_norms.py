@@ -6,7 +6,7 @@ import pytest
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.accuracy.probe import distance, factors, norm, rounding_distance
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum
 
 SHAPE = (17, 23)
 ONES = [np.ones(n) for n in SHAPE]

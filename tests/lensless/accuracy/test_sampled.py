@@ -7,8 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 WAVELENGTH = 532 * nm

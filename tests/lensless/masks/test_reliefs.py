@@ -6,8 +6,7 @@ import pytest
 import scipy.ndimage
 
 import thincam_jax as tc
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 WAVELENGTH = 500 * nm

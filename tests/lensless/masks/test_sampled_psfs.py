@@ -12,8 +12,7 @@ import thincam_jax as tc
 from helpers import finite_difference, relative_l2, value_and_slope
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.base import adjoint_error
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 WAVELENGTH, PITCH, SHAPE = 532 * nm, 5 * um, (36, 40)

@@ -7,7 +7,7 @@ import pytest
 from lensless.propagation import reference
 
 import thincam_jax as tc
-from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
+from thincam_jax.lensless.propagation.closed_form import ChirpSum
 
 WEIGHTS = np.array([0.4, 0.3 - 0.2j, -0.1 + 0.5j])
 CURVATURES = np.array([0.0, 30.0, -55.0])

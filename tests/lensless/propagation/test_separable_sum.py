@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (7, 4), (1, 1), (1, 6), (5, 1)])

@@ -25,8 +25,7 @@ from thincam_jax.imaging.operators.base import (
     require_size,
 )
 from thincam_jax.imaging.operators.masked import Scaled
-from thincam_jax.imaging.operators.matrix import Matrix
-from thincam_jax.imaging.operators.sparse import Sparse
+from thincam_jax.imaging.operators.matrix import Matrix, Sparse
 
 # Numbers of H in the memory at a time: 128 MB in float32.
 _BLOCK = 2**25

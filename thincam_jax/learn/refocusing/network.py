@@ -35,9 +35,8 @@ from thincam_jax.learn.checkpoint import (
 )
 from thincam_jax.learn.refocusing import store
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
-from thincam_jax.learn.refocusing.lens_blur import lens_blur
-from thincam_jax.learn.refocusing.linear import LinearStep
-from thincam_jax.learn.refocusing.planes import Planes
+from thincam_jax.learn.refocusing.planes import LinearStep, Planes
+from thincam_jax.learn.refocusing.scenes import lens_blur
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras

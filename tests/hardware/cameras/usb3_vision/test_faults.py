@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from thincam_jax.hardware import CameraSettings, HardwareError
+from thincam_jax.hardware.base import Disconnected, IncompleteFrame, ProtocolError, Timeout
 from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
-from thincam_jax.hardware.errors import Disconnected, IncompleteFrame, ProtocolError, Timeout
 
 SETTINGS = CameraSettings(1e-3, pixel_format="Mono12")
 RIGHT = {
