@@ -88,7 +88,9 @@ def finest(result):
 found = {level: finest(result) for level, result in results.items()}
 for level, lines in found.items():
     apart = [6 * math.log2(a / b) for a, b in zip(lines, measured.values(), strict=True)]
-    print(f"{level:.0f} dB:", *(f"{one:.2f} mm" for one in lines), "elements off:", np.round(apart, 1))
+    print(
+        f"{level:.0f} dB:", *(f"{one:.2f} mm" for one in lines), "elements off:", np.round(apart, 1)
+    )
 
 figure, ax = plt.subplots(figsize=(8.5, 3.4), layout="constrained")
 ax.plot(list(measured.values()), list(measured), "ko", markersize=9, label="measured (thesis)")

@@ -77,7 +77,8 @@ class Descents(eqx.Module):
 class Found(Module):
     """A local optimum.
 
-    - `design`; `values`: its free numbers, in the order of the space's variables.
+    - `design`; `values`: its free numbers, in the order of the space's variables, and `named`:
+      the same by name and unit, as "β of shot 1, rad/mm²".
     - `objective`: its value there.
     - `status`: end of the descent that led there.
     - `active`: the limits it lies against, in words.
@@ -85,11 +86,12 @@ class Found(Module):
     """
 
     design: Design
-    values: Float[Array, " variable"]
+    values: Float[Array, " variable"] = eqx.field(repr=False)
     objective: float
     status: Status
     active: tuple[str, ...]
     point: Float[Array, " variable"]
+    named: dict[str, float] = eqx.field(default_factory=dict)
 
 
 class Search(Module):
@@ -400,8 +402,9 @@ def ranked(space: DesignSpace, ended: Descents, separation: float) -> tuple[Foun
 
 def _found(space: DesignSpace, place, value, status: Status) -> Found:
     point = jnp.asarray(place, space.lower.dtype)
-    active = active_limits(space, point)
-    return Found(space.design(point), space.values(point), float(value), status, active, point)
+    values, active = space.values(point), active_limits(space, point)
+    named = dict(zip(space.labels, np.asarray(values).tolist(), strict=True))
+    return Found(space.design(point), values, float(value), status, active, point, named)
 
 
 def without_repeats(found: Iterable[Found], separation: float = SEPARATION) -> tuple[Found, ...]:
