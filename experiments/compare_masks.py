@@ -6,8 +6,6 @@ image of a photograph, of text and of points, in much and in little light, and c
 before? At full size some six minutes of one core. Lengths are in mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/which-mask.png"
-
 import os
 from pathlib import Path
 

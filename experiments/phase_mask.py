@@ -8,8 +8,6 @@ by gradient with the levels that can be made. It sets both beside a diffuser and
 lenses, and asks what few levels, broad light and dispersion cost. Lengths are in mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/phase-masks.png"
-
 import os
 from pathlib import Path
 

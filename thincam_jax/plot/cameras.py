@@ -61,6 +61,7 @@ def draw_psf(figure: matplotlib.figure.Figure, image: np.ndarray, grid: Grid, ti
     figure.colorbar(shown, ax=whole, label="irradiance / open aperture")
     line.plot(np.asarray(grid.x), image[image.shape[0] // 2], color="black", linewidth=0.7)
     line.set(xlabel="x (mm), through the middle", ylabel="irradiance / open aperture")
+    line.yaxis.set(label_position="right", ticks_position="right")  # away from the other scale
     line.set_title(title, fontsize=9)
 
 

@@ -156,7 +156,13 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
         Picture("mtf.png", "Transfer functions of all methods", _TRANSFER),
         Picture("contrast.png", "Contrast of chart elements", _CONTRAST),
     )
-    psf = (Picture("psf.png", "Point spread function", "Of the first capture."),)
+    psf = (
+        Picture(
+            "psf.png",
+            "Point spread function",
+            "The first capture's PSF, and a line through its middle.",
+        ),
+    )
     published = (Sentences(sentences), *config.notes) if sentences or config.notes else ()
     parts = (
         Part("Other reconstructions", [picture for pictures in others for picture in pictures]),
