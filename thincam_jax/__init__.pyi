@@ -2,6 +2,7 @@
 
 from thincam_jax.lensless.masks.pinhole import LensletArray as LensletArray
 from thincam_jax.lensless.masks.redundant_arrays import SeparableMask as SeparableMask
+from thincam_jax.plot.page import explore as explore
 
 from . import design as design
 from . import hardware as hardware
@@ -47,7 +48,6 @@ from .lensless.psf import psf as psf
 from .lensless.separable_operator import separable_operator as separable_operator
 from .measured.calibration.psf_fit import fit_psf as fit_psf
 from .measured.calibration.separable import fit_separable as fit_separable
-from .plot.explore import explore as explore
 from .reconstruction.fringe_filter import FringeScanning as FringeScanning
 from .reconstruction.imaging_model import Cameras as Cameras
 from .reconstruction.imaging_model import Psfs as Psfs

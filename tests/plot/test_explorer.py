@@ -16,8 +16,8 @@ from jax import monitoring
 
 import thincam_jax as tc
 from helpers import ROOT
-from thincam_jax.plot.explore import MODULE
 from thincam_jax.plot.explorer import Explorer
+from thincam_jax.plot.page import MODULE
 from thincam_jax.units import nm, um
 
 SENSOR = tc.Sensor((96, 256), 22 * um)

@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Real
 
-from thincam_jax._core.text import shortened
+from thincam_jax._core.table import shortened
 
 # What users give: checked below, which tells a wrong value in one line, and not by its type.
 if TYPE_CHECKING:

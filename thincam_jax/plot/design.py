@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.design.training_search import TrainingError
-from thincam_jax.plot.curves import draw_landscape
+from thincam_jax.plot.cameras import draw_landscape
 from thincam_jax.plot.frame import drawing, line_style
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.sweep import grid
-from thincam_jax.commands.sweep.grid import read_axes
+from thincam_jax.commands.sweep import point
+from thincam_jax.commands.sweep.point import read_axes
 
 RAW = {
     "seed": 0,
@@ -167,7 +167,7 @@ def test_entry_that_two_axes_set(first, second, entry):
 
 
 def test_too_many_points(monkeypatch):
-    monkeypatch.setattr(grid, "MOST_POINTS", 9)
+    monkeypatch.setattr(point, "MOST_POINTS", 9)
     assert fault("seed=0:4:5", "sensor.bit_depth=8,12") == (
         "the grid has 10 points; give at most 9"
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thincam_jax.commands.explore import Browser, Port, serve_page
+from thincam_jax.commands.run import Browser, Port, serve_page
 from thincam_jax.commands.terminal import (
     ConfigFile,
     DryRun,
@@ -56,7 +56,7 @@ def capture(
 
     with reported(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import write_whole
-        from thincam_jax.commands import explain
+        from thincam_jax.commands import run
         from thincam_jax.commands.checked_config import dump_config
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
@@ -70,7 +70,7 @@ def capture(
             raise ConfigError(f"--out {store} exists; --resume goes on with it, else give another")
         plan = build_plan(asked)
         if dry_run:
-            explain.dry_run(asked, f"writes to {store}: {len(plan.steps)} frames", plan)
+            run.explain_run(asked, f"writes to {store}: {len(plan.steps)} frames", plan)
             return
         kept = f"0 of {len(plan.steps)} frames are kept"
         procedure = asked.acquisition.build(settle=asked.display.settle)
