@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem, Objective
@@ -107,6 +108,7 @@ class Search(Module):
 
 
 @checked
+@watched("searching designs")
 def find_designs(
     problem: DesignProblem, settings: SearchSettings | None = None, *, key: Key
 ) -> Search:
