@@ -159,7 +159,7 @@ def test_a_former_name_leads_to_the_one_of_today(package, name, nearest):
 
 
 def test_documented_paths_need_no_import_of_their_own():
-    paths = "imaging.operators.Matrix", "lensless.masks.reliefs.diffuser", "design.phase_mask"
+    paths = "imaging.operators.Matrix", "lensless.masks.phase.diffuser", "design.phase_mask"
     imported_by("import thincam_jax as tc\n" + "\n".join(f"tc.{path}" for path in paths))
 
 

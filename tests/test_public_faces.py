@@ -30,11 +30,11 @@ MODULES = (
     *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
     *("waveguide.design.plate", "design.ranking", "design.sensitivity"),
     *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
-    "lensless.masks.reliefs",
+    "lensless.masks.phase",
     *("waveguide.measured.screen_fit", "measured.exposures", "measured.sensor"),
     *("reconstruction.depth.find", "reconstruction.problem"),
     *("studies.evaluate", "studies.prepared", "hardware.studies.images", "waveguide.distance"),
-    *("studies.response", "studies.study", "waveguide.colours"),
+    *("studies.result", "studies.study", "waveguide.colours"),
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.

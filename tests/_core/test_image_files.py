@@ -15,7 +15,7 @@ import tifffile
 import thincam_jax as tc
 from thincam_jax._core import image_files
 from thincam_jax.commands.config_file import ConfigError, read_raw
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.learn.checkpoint import CheckpointError, read_description
 from thincam_jax.measured import read_image
 from thincam_jax.measured.raw import CaptureFileError

@@ -12,7 +12,7 @@ import pytest
 from thincam_jax._core.table import Table
 from thincam_jax.commands.report import Gallery, Page, Part, Picture, render_report
 from thincam_jax.commands.sections import ExperimentConfig
-from thincam_jax.imaging.display import png_bytes
+from thincam_jax.imaging.encoding import png_bytes
 
 ENVIRONMENT = {
     "precision": "float32",

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 from design import small
 
-from thincam_jax.design import (
-    DesignSpace,
-    PhotonNoise,
-    SearchSettings,
-    cosine_transforms,
-    find_front,
-    fronts,
-)
+from thincam_jax.design import DesignSpace, PhotonNoise, SearchSettings, find_front, fronts
 from thincam_jax.design.fronts import non_dominated
 from thincam_jax.design.objectives import ResolutionLimit
 from thincam_jax.design.space import Limits
@@ -149,11 +142,3 @@ def test_near_a_place_mask_pixels_hold():
         designs = jax.vmap(near.design)(corners)
         assert np.all(designs.beta[:, 0] * designs.width <= np.pi / 0.05 * (1 + 1e-9))
         assert np.all(near.upper > near.lower)
-
-
-COMPILED = ("fold", "transform", "waves", "series")
-fold, transform, waves, series = (jax.jit(getattr(cosine_transforms, n)) for n in COMPILED)
-
-
-def image(shape):
-    return jnp.asarray(np.random.default_rng(3).normal(size=shape))

@@ -13,7 +13,6 @@ from design.setting import HIGHEST, setup
 from helpers import count_traces, finite_difference
 from thincam_jax.design import BayesError, PhotonNoise, Polar, PowerLaw, SignalNoise
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import (
     Channels,
     ResolutionLimit,
@@ -26,6 +25,7 @@ from thincam_jax.design.objectives import (
     unevenness,
     worst_ratio_db,
 )
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction import phase_pairs
 

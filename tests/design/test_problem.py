@@ -7,8 +7,8 @@ import pytest
 from design import small
 
 from thincam_jax.design import BayesError, DesignSpace, FrequencyCounts, PhotonNoise, design_problem
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import bayes_error, channels
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.design.space import Limits
 from thincam_jax.reconstruction import phase_pairs
 

@@ -13,7 +13,6 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.design import Polar, PowerLaw, Setup
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import bayes_error, channels, ring_means
 from thincam_jax.design.response import (
     capture_light,
@@ -22,6 +21,7 @@ from thincam_jax.design.response import (
     signal_variance,
     spectral_density,
 )
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.exposures import Exposures

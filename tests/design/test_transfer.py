@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import Polar, Setup, SignalNoise, objectives, shots, transfer
-from thincam_jax.design.frequencies import Quadrant
+from thincam_jax.design import Polar, Setup, SignalNoise, objectives, ranking, shots
 from thincam_jax.design.objectives import Channels, ObjectiveData
-from thincam_jax.design.transfer import modulation_transfer
+from thincam_jax.design.ranking import modulation_transfer
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction import phase_pairs
@@ -100,7 +100,7 @@ def test_of_even_responses_in_closed_form(monkeypatch):
         return Channels(*full, jnp.full(shape[1:], 6.0), frequencies.weight)
 
     monkeypatch.setattr(objectives, "channels", even)
-    monkeypatch.setattr(transfer, "channels", even)
+    monkeypatch.setattr(ranking, "channels", even)
     # Of a size of its own, which is not compiled yet.
     found = modulation_transfer(DESIGN, replace(data(), frequencies=Quadrant(jnp.asarray(9.0), 80)))
     np.testing.assert_allclose(found.chain, 6 / 7)

@@ -12,8 +12,7 @@ from PIL.ImageOps import exif_transpose
 
 import thincam_jax as tc
 from thincam_jax.imaging import encoding
-from thincam_jax.imaging.display import eight_bit, png_bytes
-from thincam_jax.imaging.encoding import decode_srgb, encode_srgb, upright
+from thincam_jax.imaging.encoding import decode_srgb, eight_bit, encode_srgb, png_bytes, upright
 
 CODES = np.random.default_rng(0).integers(0, 256, (9, 14), dtype=np.uint8)
 CODES[0, :2] = 0, 255

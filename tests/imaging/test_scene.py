@@ -161,8 +161,9 @@ def test_a_wavelength_is_light_of_one_colour():
     plane = ImagePlane(picture((3, 4)), 10.0, 1.0)
     guessed = Scene(plane, wavelength=530 * nm)
     assert eqx.tree_equal(guessed, Scene(plane, Spectrum(530 * nm)), Scene(plane, 530 * nm))
-    for light in ({}, {"spectrum": Spectrum(530 * nm), "wavelength": 530 * nm}):
-        with pytest.raises(TypeError, match=r"^give the light of a Scene once: a Spectrum, or .*$"):
+    both = {"spectrum": Spectrum(530 * nm), "wavelength": 530 * nm}
+    for light, fault in (({}, "is missing"), (both, "is given twice")):
+        with pytest.raises(TypeError, match=rf"^the light of the Scene {fault}; give wavelength="):
             Scene(plane, **light)
 
 

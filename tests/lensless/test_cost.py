@@ -18,8 +18,8 @@ import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
-from thincam_jax.lensless.cost import convolution_cost, psf_cost
 from thincam_jax.lensless.method import PsfMethod, psf_method
+from thincam_jax.lensless.resolve import convolution_cost, psf_cost
 
 # The module itself: the package's attribute of that name is the function.
 PSF = importlib.import_module("thincam_jax.lensless.psf")
@@ -167,7 +167,7 @@ PROCESS = """
     import importlib, json, sys
     import jax, jax.numpy as jnp
     import thincam_jax as tc
-    from thincam_jax.lensless.cost import psf_cost
+    from thincam_jax.lensless.resolve import psf_cost
     from thincam_jax.lensless.method import psf_method
 
     def held(name):

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.lensless.field import tangents_of
-from thincam_jax.lensless.light import fall_of_light, light_over_field, shading
+from thincam_jax.lensless.field import fall_of_light, light_over_field, shading, tangents_of
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.units import deg, nm, um
 

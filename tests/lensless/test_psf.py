@@ -125,7 +125,7 @@ def test_first_zero_of_the_fringe_scanned_response(distance, zero):
 @pytest.mark.parametrize("distance", [6.5, 5.0])
 def test_eq_3_31_and_3_49_corrected(distance):
     """From `paraxial_response`: (π/β)e^{jX}cos(πλdρ²), and the pair's difference with its X/2."""
-    from thincam_jax.lensless.propagation.paraxial import paraxial_response
+    from thincam_jax.lensless.propagation.closed_form import paraxial_response
 
     beta, rho2 = 25.0, np.linspace(0.0, 900.0, 301)
     x, turn = np.pi**2 * rho2 / beta, np.cos(np.pi * WAVELENGTH * distance * rho2)

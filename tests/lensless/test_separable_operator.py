@@ -42,7 +42,7 @@ def test_it_is_what_the_camera_captures():
 
 
 @pytest.mark.thorough
-@pytest.mark.filterwarnings("ignore::thincam_jax.lensless.sampling.SamplingWarning")
+@pytest.mark.filterwarnings("ignore::thincam_jax.lensless.resolve.SamplingWarning")
 def test_a_mask_of_many_terms_has_an_operator():
     """Cells at random: 150 terms, 22,500 products, of which the 11 rows of the kernel leave 11."""
     open_cells = np.random.default_rng(2).integers(0, 2, (200, 150)).astype(float)

@@ -8,7 +8,7 @@ import scipy.ndimage
 
 from thincam_jax.measured import Raw, prepare
 from thincam_jax.measured.bayer import PATTERNS, demosaic, demosaic_mask, mosaic
-from thincam_jax.measured.dark import find_levels
+from thincam_jax.measured.merging import find_levels
 from thincam_jax.measured.preparation import centre_psf, clean
 
 

@@ -23,7 +23,7 @@ from thincam_jax.plot.objects import draw_recording
 from thincam_jax.plot.studies import _by_synthesis
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies.design import FoundDesigns
-from thincam_jax.studies.response import Response, ResponseLimits
+from thincam_jax.studies.result import Response, ResponseLimits
 from thincam_jax.units import nm, um
 
 

@@ -81,9 +81,21 @@ def test_the_field_covers_the_scene_by_default(solver):
 def test_scenes_inside_have_none(snr, shading):
     """Nor does shading make some: what explains it outside is haze."""
     for size, field in ((0.7, {}), (0.8, {"field_width": 0.8 * SHAPE[1] * PITCH * FAR / DISTANCE})):
-        result = tc.reconstruct(seen(size, snr, shading, **field)[1], tc.AdmmTV())
-        assert "outside of" not in result.reason
-        assert result.image.shape[0] == SHAPE[0]
+        recording = seen(size, snr, shading, **field)[1]
+        for solver in (tc.AdmmTV(), tc.Ridge()):
+            result = tc.reconstruct(recording, solver)
+            assert "outside of" not in result.reason
+            assert result.image.shape[0] == SHAPE[0]
+
+
+@pytest.mark.thorough
+def test_ridge_finds_it_too():
+    plane, recording = seen(1.25)
+    result: Any = tc.reconstruct(recording, tc.Ridge())
+    assert "the image has field_shape=" + str(result.image.shape) in result.reason
+    kept: Any = tc.reconstruct(with_field(recording, SHAPE), tc.Ridge())
+    assert "give field_shape=" in kept.reason
+    assert likeness(result, plane, SHAPE) > likeness(kept, plane) + 0.1
 
 
 def test_other_models_and_starts_are_as_before():

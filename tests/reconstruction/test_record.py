@@ -70,5 +70,7 @@ def test_solvers_by_name():
     recording = tc.record(CAMERA, scene())
     image = tc.reconstruct(recording, "wiener").image
     np.testing.assert_array_equal(image, tc.reconstruct(recording, tc.Wiener()).image)
-    with pytest.raises(ValueError, match=r"'weiner' is unknown; choose one of 'wiener', .*'pnp'"):
-        tc.reconstruct(recording, "weiner")
+    for given, meant in (("weiner", "wiener"), ("AdmmTV", "admm_tv"), ("admm-tv", "admm_tv")):
+        said = f"'{given}' is unknown; choose one of 'wiener', .*; did you mean '{meant}'\\?$"
+        with pytest.raises(ValueError, match=said):
+            tc.reconstruct(recording, given)

@@ -7,7 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.lensless.propagation.paraxial import paraxial_response
+from thincam_jax.lensless.propagation.closed_form import paraxial_response
 from thincam_jax.reconstruction import fringe_scanning, phase_pairs
 from thincam_jax.reconstruction.synthesis import contrasts, harmonics, phase_contrasts, separate
 from thincam_jax.units import nm, um

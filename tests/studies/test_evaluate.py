@@ -14,13 +14,18 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.measured import Preparation, Raw, prepare
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies import Method
-from thincam_jax.studies import held_out as module
+from thincam_jax.studies import trials as module
 from thincam_jax.studies.evaluate import Resolved, Scores, evaluate
-from thincam_jax.studies.held_out import GainOverPhotographs, further_photographs, hold_out
 from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
-from thincam_jax.studies.response import method_response
+from thincam_jax.studies.result import method_response
 from thincam_jax.studies.study import Target
-from thincam_jax.studies.trials import compare_trials, simulate_trials
+from thincam_jax.studies.trials import (
+    GainOverPhotographs,
+    compare_trials,
+    further_photographs,
+    hold_out,
+    simulate_trials,
+)
 
 CHART, PICTURE = 0, 1
 

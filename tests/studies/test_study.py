@@ -17,11 +17,17 @@ from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import run_study
-from thincam_jax.lensless.light import fall_of_light
+from thincam_jax.lensless.field import fall_of_light
 from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.studies import Method
-from thincam_jax.studies.evaluate import coupled, field_shape, reconstructor
-from thincam_jax.studies.simulate import expose, noise_free, stacked
+from thincam_jax.studies.evaluate import (
+    coupled,
+    expose,
+    field_shape,
+    noise_free,
+    reconstructor,
+    stacked,
+)
 from thincam_jax.units import um
 
 

@@ -75,7 +75,7 @@ class Landscape:
         - `costs`: where they are drawn over a single number; by default on the line.
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
-        from thincam_jax.plot.curves import draw_landscape
+        from thincam_jax.plot.cameras import draw_landscape
         from thincam_jax.plot.frame import new_figure
 
         ax = new_figure(7.6, 6.0).subplots() if ax is None else ax

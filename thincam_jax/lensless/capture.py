@@ -14,7 +14,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
 from thincam_jax.lensless.plan.run import CapturePlan, run_plan
-from thincam_jax.lensless.sampling import warn_if_unresolved
+from thincam_jax.lensless.resolve import warn_if_unresolved
 
 _ON_AXIS = (
     "the sensor's angular_response is left out: every point has the light of the axis; give "

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.progress import Progress, Step, carry_out
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
-from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
@@ -41,8 +41,15 @@ from thincam_jax.reconstruction.depth.refocus import (
     refocus_distances,
 )
 from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.studies.evaluate import reconstructor, rounded, sample
-from thincam_jax.studies.simulate import Capture, expose, noise_free, stacked
+from thincam_jax.studies.evaluate import (
+    Capture,
+    expose,
+    noise_free,
+    reconstructor,
+    rounded,
+    sample,
+    stacked,
+)
 from thincam_jax.studies.study import Method, Study, Target
 
 if TYPE_CHECKING:

@@ -20,8 +20,7 @@ from thincam_jax.commands.study.build import build_study
 from thincam_jax.design.search import Search
 from thincam_jax.studies import design as designs
 from thincam_jax.studies.design_scores import DesignScores
-from thincam_jax.studies.evaluate import evaluate_method
-from thincam_jax.studies.simulate import take
+from thincam_jax.studies.evaluate import evaluate_method, take
 from thincam_jax.studies.trials import Spread
 
 QUICK = ("search.starts=2", "search.samples=8", "search.steps=3")

@@ -8,8 +8,7 @@ from commands.study import tiny
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.studies.evaluate import reconstructor
-from thincam_jax.studies.simulate import expose, noise_free, stacked, take
+from thincam_jax.studies.evaluate import expose, noise_free, reconstructor, stacked, take
 
 ELECTRONS = ("sensor.electrons=2e5", "noise={read_noise: 2}")
 

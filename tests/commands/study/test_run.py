@@ -19,10 +19,14 @@ from thincam_jax.commands.run_folder import RunFolder, origin_of
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import run_study
-from thincam_jax.studies.evaluate import Resolved, Scores, evaluate_method
-from thincam_jax.studies.response import ResponseLimits, method_response
-from thincam_jax.studies.result import MethodScores, StudyScores, findings
-from thincam_jax.studies.simulate import take
+from thincam_jax.studies.evaluate import Resolved, Scores, evaluate_method, take
+from thincam_jax.studies.result import (
+    MethodScores,
+    ResponseLimits,
+    StudyScores,
+    findings,
+    method_response,
+)
 from thincam_jax.studies.study import Published
 
 EVIL = "<script>alert(1)</script> & \"quoted\" <img src='http://example.org/x.png'>"

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.sweep.grid import read_axes
+from thincam_jax.commands.sweep.point import read_axes
 
 RAW = {
     "seed": 0,

@@ -26,23 +26,24 @@ from hardware.memory_rig import (
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
 from thincam_jax._core.files import WriteError
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.acquisition import journal, recorder, taker
+from thincam_jax.hardware.acquisition import recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
-from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.base import Frame, Region
-from thincam_jax.hardware.displays import settle
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.acquisition.taker import AutoExposure
+from thincam_jax.hardware.base import (
     Disconnected,
+    Frame,
     IncompleteFrame,
     NotFound,
     NotHomed,
     OutOfRange,
     ProtocolError,
+    Region,
     Saturated,
     Timeout,
 )
+from thincam_jax.hardware.displays import settle
 from thincam_jax.hardware.plans import hadamard, pictures
 from thincam_jax.measured.calibration import HadamardCaptures, HadamardSeries, recover_matrix
 
@@ -449,7 +450,7 @@ def test_a_journal_that_cannot_be_made_is_told_and_made_later(tmp_path, monkeypa
         return os.open(path, flags, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(journal, "os", SimpleNamespace(**{**vars(os), "open": no_inode}))
+        patch.setattr(recorder, "os", SimpleNamespace(**{**vars(os), "open": no_inode}))
         with pytest.raises(WriteError, match="journal.jsonl: cannot be written .*; make room"):
             run(World(), tmp_path / "a.zarr")
     assert run(World(), tmp_path / "a.zarr").complete

@@ -11,8 +11,15 @@ import pytest
 from hardware.cameras import pylablib_double
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.base import Identity, Region
-from thincam_jax.hardware.errors import Disconnected, IncompleteFrame, NotFound, OutOfRange, Timeout
+from thincam_jax.hardware.base import (
+    Disconnected,
+    Identity,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    Region,
+    Timeout,
+)
 from thincam_jax.hardware.registry import driver_report, open_device
 
 SENSOR = 24, 40

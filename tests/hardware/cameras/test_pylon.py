@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.base import Region
-from thincam_jax.hardware.errors import Disconnected, IncompleteFrame, NotFound, OutOfRange, Timeout
+from thincam_jax.hardware.base import (
+    Disconnected,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    Region,
+    Timeout,
+)
 from thincam_jax.hardware.registry import open_device
-from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.devices import Faults
 from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
 from thincam_jax.hardware.virtual.rig import bits_of
 

@@ -13,7 +13,7 @@ from hardware.commands import tiny
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.hardware.commands.config import CaptureConfig
 from thincam_jax.hardware.commands.run import picture_levels
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 
 PHASES = (0.0, 0.7, 2.8, 4.9, 5.65)
 TABLE = {"phases": [f"{phase} rad" for phase in PHASES], "wavelength": "532 nm", "gap": 0.5}

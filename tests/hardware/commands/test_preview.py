@@ -13,7 +13,7 @@ from commands.test_cli import call
 from hardware.commands import tiny
 from hardware.memory_rig import MemoryCamera, MemoryDisplay, World
 
-from thincam_jax.hardware.errors import Busy
+from thincam_jax.hardware.base import Busy
 from thincam_jax.hardware.holder import held
 
 pytest.importorskip("starlette")

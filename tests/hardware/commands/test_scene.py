@@ -10,7 +10,7 @@ from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 from hardware.commands import tiny
 
-from thincam_jax.hardware.displays.grey_levels import GreyLevels
+from thincam_jax.hardware.displays.levels import GreyLevels
 
 SCENE = yaml.safe_load(tiny.METHOD_B)
 SCENE["camera"]["exposure"] = "5 ms"

@@ -11,9 +11,13 @@ from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.acquisition.acquire import acquire
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.displays.grey_levels import GreyLevels, linear_levels, measured_levels
+from thincam_jax.hardware.displays.levels import (
+    GreyLevels,
+    PhaseLevels,
+    linear_levels,
+    measured_levels,
+)
 from thincam_jax.hardware.displays.patterns import pattern_levels
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
 from thincam_jax.hardware.plans import grey_levels
 from thincam_jax.units import nm, um
 

@@ -13,7 +13,7 @@ from hardware.displays.x_server import (
 )
 from PIL import Image
 
-from thincam_jax.hardware.errors import Disconnected, NotFound, OutOfRange
+from thincam_jax.hardware.base import Disconnected, NotFound, OutOfRange
 from thincam_jax.hardware.registry import open_device
 
 SIZE = 24, 40

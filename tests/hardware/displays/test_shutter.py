@@ -12,10 +12,10 @@ from thincam_jax.hardware.acquisition.plan import WHITE
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.displays.patterns import pattern_levels
-from thincam_jax.hardware.displays.shutter import Shutter
+from thincam_jax.hardware.displays.settle import Shutter
 from thincam_jax.hardware.plans import scene
 from thincam_jax.hardware.registry import open_device
-from thincam_jax.hardware.virtual.display import VirtualDisplay
+from thincam_jax.hardware.virtual.devices import VirtualDisplay
 
 
 @pytest.fixture

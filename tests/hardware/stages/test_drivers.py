@@ -6,7 +6,7 @@ import threading
 import pytest
 from stage_faults import STAGES
 
-from thincam_jax.hardware.errors import Busy, NotHomed, OutOfRange, ProtocolError, Timeout
+from thincam_jax.hardware.base import Busy, NotHomed, OutOfRange, ProtocolError, Timeout
 from thincam_jax.hardware.stages import serial_stage
 from thincam_jax.hardware.virtual.grbl import PULL_OFF
 from thincam_jax.hardware.virtual.serial_device import Motion

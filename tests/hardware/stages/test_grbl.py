@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from thincam_jax.hardware.errors import Disconnected, NotHomed, ProtocolError
+from thincam_jax.hardware.base import Disconnected, NotHomed, ProtocolError
 from thincam_jax.hardware.stages import grbl
 from thincam_jax.hardware.stages.grbl import GrblMessage, GrblStage, parse_line
 from thincam_jax.hardware.stages.zaber import ZaberMessage, ZaberStage, parse_message

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Busy,
     Disconnected,
     NotFound,

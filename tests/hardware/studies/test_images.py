@@ -16,7 +16,7 @@ from thincam_jax.hardware.studies.rig import CountingCamera, reconstruct_picture
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.measured.bayer import mosaic, shifted_pattern
-from thincam_jax.studies.simulate import noise_free
+from thincam_jax.studies.evaluate import noise_free
 from thincam_jax.studies.study import Method
 from thincam_jax.units import nm
 from thincam_jax.waveguide.system import monitor_system

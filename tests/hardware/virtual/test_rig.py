@@ -10,9 +10,8 @@ import scipy
 import thincam_jax as tc
 from helpers import read_fiducial
 from thincam_jax.hardware import CameraSettings, registry
-from thincam_jax.hardware.base import Region
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
-from thincam_jax.hardware.errors import NotHomed, OutOfRange
+from thincam_jax.hardware.base import NotHomed, OutOfRange, Region
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.optics import (
     ModulatorOptics,

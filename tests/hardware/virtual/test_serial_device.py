@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from thincam_jax.hardware.errors import Disconnected, NotHomed
+from thincam_jax.hardware.base import Disconnected, NotHomed
 from thincam_jax.hardware.stages.grbl import GrblStage
 from thincam_jax.hardware.stages.zaber import ZaberStage
 from thincam_jax.hardware.virtual.grbl import VirtualGrbl

@@ -16,7 +16,7 @@ from thincam_jax.imaging.metrics.mtf import (
     low_frequency_value,
     zero_crossings,
 )
-from thincam_jax.studies.response import method_response
+from thincam_jax.studies.result import method_response
 
 WAVELENGTH = 5e-4
 STEP = 0.05

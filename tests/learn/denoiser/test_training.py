@@ -15,9 +15,9 @@ import pytest
 
 from helpers import ROOT
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.denoiser.crops import draw_crops, loss
 from thincam_jax.learn.denoiser.network import LEAST, MOST, Denoiser, DenoiserOptions, create
 from thincam_jax.learn.denoiser.pictures import TILE, drawn, photographs, split
+from thincam_jax.learn.denoiser.reconstructions import draw_crops, loss
 from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, train_denoiser
 from thincam_jax.learn.training import TrainingOptions
 

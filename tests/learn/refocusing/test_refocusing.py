@@ -11,13 +11,17 @@ from refocusing_scores import flat_scene, multiscale_ssim, scores, sub_aperture_
 
 import thincam_jax as tc
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.learn.refocusing.lens_blur import lens_blur
-from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork, explain
 from thincam_jax.learn.refocusing.planes import Planes
-from thincam_jax.learn.refocusing.scenes import LayeredScene, SceneOptions, captured, draw_batch
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.refocusing.scenes import (
+    LayeredScene,
+    SceneOptions,
+    captured,
+    draw_batch,
+    lens_blur,
+)
+from thincam_jax.learn.refocusing.sources import dead_leaves, photographs
+from thincam_jax.learn.refocusing.train import examples, loss, relative_error
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.units import nm, um
 

@@ -10,9 +10,8 @@ from helpers import relative_l2
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.accuracy.lines import COUNT, SparseGrid, chosen
 from thincam_jax.lensless.accuracy.probe import distance, factors, norm, rounding_distance
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.lensless.propagation.separable import SeparableSum
 from thincam_jax.units import nm, um
 
 SEEDS = range(300)

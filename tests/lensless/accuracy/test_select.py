@@ -14,7 +14,7 @@ import thincam_jax as tc
 from helpers import in_full, point_psf, relative_l2
 from thincam_jax.lensless.accuracy.select import predict_cost, predicted_error, probe_of
 from thincam_jax.lensless.masks import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser
+from thincam_jax.lensless.masks.phase import diffuser
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 

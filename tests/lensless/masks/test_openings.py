@@ -8,8 +8,7 @@ import scipy.ndimage
 
 import thincam_jax as tc
 from helpers import finite_difference, value_and_slope
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 

@@ -10,8 +10,7 @@ from scipy import ndimage
 
 import thincam_jax as tc
 from helpers import finite_difference, point_psf, relative_l2, value_and_slope
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 WAVELENGTH, PITCH, SHAPE = 532 * nm, 5 * um, (36, 40)

@@ -21,8 +21,7 @@ from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.display import on_display
-from thincam_jax.lensless.masks.phase import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.lensless.psf import psf_about_ray, spectral_psf
 from thincam_jax.units import nm, um
 

@@ -10,7 +10,7 @@ from lensless.propagation.reference import chirp, chirp_by_quadrature
 import thincam_jax as tc
 from helpers import finite_difference
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
+from thincam_jax.lensless.propagation.closed_form import ChirpSum
 
 compiled = jax.jit(chirp_integral)
 B = float(np.pi / (500e-6 * 6.5))  # Fresnel curvature of the thesis' camera, 967 rad/mm²

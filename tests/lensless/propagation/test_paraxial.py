@@ -7,7 +7,7 @@ from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import point_psf
-from thincam_jax.lensless.propagation.paraxial import paraxial_response
+from thincam_jax.lensless.propagation.closed_form import paraxial_response
 
 BETA, PHASE = 25.0, 0.8
 

@@ -10,10 +10,12 @@ import pytest
 import thincam_jax as tc
 from helpers import count_traces, quick, relative_l2, value_and_slope
 from thincam_jax.lensless.method import LATTICE_POINTS, AccuracyWarning
-from thincam_jax.lensless.propagation.lattice import lattice
-from thincam_jax.lensless.propagation.separable import separable
-from thincam_jax.lensless.propagation.separable_field import separable_image
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import (
+    SeparableSum,
+    lattice,
+    separable,
+    separable_image,
+)
 from thincam_jax.units import nm, um
 
 SENSOR = tc.Sensor((14, 19), 11 * um)

@@ -9,17 +9,17 @@ import pytest
 import usb.core
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.base import Region
-from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
-from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Busy,
     NotFound,
     OutOfRange,
     PermissionDenied,
     ProtocolError,
+    Region,
     Timeout,
 )
+from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
+from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS
 from thincam_jax.hardware.registry import open_device
 from thincam_jax.hardware.virtual.rig import bits_of
 from thincam_jax.hardware.virtual.usb3_vision import TRIGGER_MODE

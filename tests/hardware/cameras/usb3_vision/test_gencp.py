@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from thincam_jax.hardware import CameraSettings, HardwareError
+from thincam_jax.hardware.base import Disconnected, IncompleteFrame, ProtocolError, Timeout
 from thincam_jax.hardware.cameras.usb3_vision import gencp, link, stream
 from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Command
-from thincam_jax.hardware.errors import Disconnected, IncompleteFrame, ProtocolError, Timeout
 
 
 def test_commands_to_the_byte():
