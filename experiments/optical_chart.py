@@ -64,7 +64,6 @@ study = tc.studies.Study(
     methods,
     (tc.studies.Target.usaf1951(distance=250.0, width=object_width),),
     object_distance=250.0,
-    noise=tc.GaussianNoise(38.0, "without_mean"),
 )
 
 # %%
@@ -76,21 +75,19 @@ study = tc.studies.Study(
 
 levels = {"full": (30.0, 34.0, 38.0, 42.0), "small": (34.0, 38.0)}[SIZE]
 results = {
-    level: replace(study, noise=tc.GaussianNoise(level, "without_mean")).run() for level in levels
+    level: tc.studies.evaluate_target(
+        replace(study, noise=tc.GaussianNoise(level, "without_mean")), study.targets[0]
+    )
+    for level in levels
 }
-
-
-def finest(result):
-    """The finest line pair that a rule, not the eye, finds resolved, mm."""
-    return [one.resolved_mm for one in result.scores.methods.values()]
-
-
-found = {level: finest(result) for level, result in results.items()}
+# The finest line pair that a rule, not the eye, finds resolved, mm.
+found = {
+    level: [one.scores.resolved.object_mm for one in result.values()]
+    for level, result in results.items()
+}
 for level, lines in found.items():
     apart = [6 * math.log2(a / b) for a, b in zip(lines, measured.values(), strict=True)]
-    print(
-        f"{level:.0f} dB:", *(f"{one:.2f} mm" for one in lines), "elements off:", np.round(apart, 1)
-    )
+    print(f"{level:.0f} dB:", np.round(lines, 2), "mm, elements off:", np.round(apart, 1))
 
 figure, ax = plt.subplots(figsize=(8.5, 3.4), layout="constrained")
 ax.plot(list(measured.values()), list(measured), "ko", markersize=9, label="measured (thesis)")
@@ -129,7 +126,7 @@ def profile(image, element):
 
 
 figure, axes = plt.subplots(2, len(methods), figsize=(13, 4.6), sharey=True, layout="constrained")
-for column, (name, seen) in zip(axes.T, chosen.evaluations["USAF-1951"].items(), strict=True):
+for column, (name, seen) in zip(axes.T, chosen.items(), strict=True):
     size = seen.scores.resolved.object_mm
     at = min(range(len(elements)), key=lambda i: abs(line_pair(elements[i], object_width) - size))
     for ax, element in zip(column, elements[at : at + 2], strict=True):
@@ -141,3 +138,11 @@ for ax, word in zip(axes[:, 0], ("resolved", "next"), strict=True):
     ax.set(ylabel=f"{word}\nradiance (bars = 1)")
 figure.savefig(FIGURES / "profiles.png", dpi=110)
 plt.show()
+
+# %%
+# At 34 and 38 dB every method is within 1.3 elements of the measurement; at the small size, which
+# has a 64th of the pixels, within two.
+
+for level in (34.0, 38.0):
+    apart = {"full": 0.17, "small": 0.26}[SIZE]
+    np.testing.assert_allclose(found[level], list(measured.values()), rtol=apart)
