@@ -6,7 +6,6 @@ in the whole field that the sensor sees how much light moves out, and how far.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
