@@ -36,7 +36,7 @@ from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.imaging.targets.patterns import point_grid, slanted_edge
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence
-from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
+from thincam_jax.lensless.masks.phase import voronoi_fresnel
 from thincam_jax.lensless.phase_shift import harmonic_otf
 from thincam_jax.measured import calibration
 from thincam_jax.measured.exposures import ExposedFrames, merge_exposures

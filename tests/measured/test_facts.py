@@ -105,21 +105,6 @@ def files(tmp_path):
     return tmp_path / "psf.dng", tmp_path / "capture.dng"
 
 
-def test_a_dng_works_by_default(files):
-    psf, capture = files
-    found = Inputs(Sources(psf)).prepare(capture)
-    raws = read_image(psf), read_image(capture)
-    expected = prepare(*raws, background=BLACK, options=Preparation(bayer="BGGR"))
-    np.testing.assert_array_equal(found.capture, expected.capture)
-    np.testing.assert_array_equal(found.psf, expected.psf)
-    assert (
-        found.log.options.bayer == "BGGR"
-        and found.log.capture.background == "black level of the file"
-    )
-    means = found.capture.mean(axis=(1, 2))
-    assert means[0] > 1.2 * means[1] > 1.8 * means[2]  # red is red
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -135,13 +120,6 @@ def test_contradictions_are_refused_with_both_values(files, given, message):
     assert "\n" not in str(caught.value)
 
 
-def test_what_the_messages_advise(files):
-    psf, capture = files
-    given = {"preparation": Preparation(bayer="BGGR"), "background": 256.0, "bits": None}
-    found = Inputs(Sources(psf, **given)).prepare(capture)
-    np.testing.assert_array_equal(found.capture, Inputs(Sources(psf)).prepare(capture).capture)
-
-
 def test_facts_are_not_dropped_in_python(files):
     """`prepare` takes pattern and black level of the files, and refuses what contradicts them."""
     raws = [read_image(path) for path in files]
@@ -153,13 +131,6 @@ def test_facts_are_not_dropped_in_python(files):
     )
     assert found.capture.shape == (3, *SHAPE)
     np.testing.assert_array_equal(found.capture, given.capture)
-
-
-def test_two_patterns(files):
-    psf, capture = files
-    psf.write_bytes(dng("RGGB"))
-    with pytest.raises(MeasurementError, match=r"says the pattern BGGR and the PSF's .* RGGB"):
-        Inputs(Sources(psf)).prepare(capture)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -233,3 +204,10 @@ def test_exposure_of_fits(monkeypatch, card):
     monkeypatch.setattr(read, "read_array", lambda kind, data, key: np.ones(SHAPE))
     assert read._read_container("fits", None, header)[1] == {"exposure": 4e-3}
     assert read._read_container("mat", None, header)[1] == {}
+
+
+def test_two_patterns(files):
+    psf, capture = files
+    psf.write_bytes(dng("RGGB"))
+    with pytest.raises(MeasurementError, match=r"says the pattern BGGR and the PSF's .* RGGB"):
+        Inputs(Sources(psf)).prepare(capture)

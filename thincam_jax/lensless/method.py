@@ -171,7 +171,7 @@ def psf_method(
         if counted or has_few_terms(mask):
             return method
         text = _LATTICE.format(parts_of(mask), method.model)
-        warnings.warn(text, AccuracyWarning, stacklevel=5)
+        warnings.warn(text, AccuracyWarning, stacklevel=6)
         return replace(method, nodes=LATTICE_POINTS)
     least = 3 if method.pixel_integration else 1
     return replace(

@@ -28,25 +28,19 @@ from thincam_jax._core.precision import (
 )
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask, require_factored
-from thincam_jax.lensless.method import (
-    PIXEL_NODES,
-    SAMPLED,
-    Model,
-    PsfMethod,
-    as_method,
-    has_few_terms,
-)
+from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, has_few_terms
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
-from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
-from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
+from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
 from thincam_jax.lensless.propagation.geometric import geometric
-from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.lensless.propagation.separable import separable
-from thincam_jax.lensless.propagation.separable_field import separable_image
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
+from thincam_jax.lensless.propagation.separable import (
+    SeparableSum,
+    centre_phase,
+    separable,
+    separable_image,
+)
 from thincam_jax.lensless.propagation.skew import skew_image
 from thincam_jax.lensless.resolve import resolve
 
@@ -86,7 +80,7 @@ def psf(
     `wavelength` and `object_distance`.
 
     **Errors**: ValueError for what is out of range, for unknown models and for phases that float32
-    does not hold (see `thincam_jax.lensless.digits`), TypeError for a mask
+    does not hold (see `thincam_jax.lensless.resolve`), TypeError for a mask
     that the model cannot take, MemoryError (before any work, with the estimate) for a size that
     does not fit.
 
@@ -103,9 +97,7 @@ def psf(
     **See also**: `otf`, `choose_model`, `capture`.
     """
     path = camera.path(wavelength, object_distance, at)
-    return _in_precision_of(
-        camera, _psf, *resolve(camera, path, as_method(model, pixel_integration))
-    )
+    return _computed(_psf, camera, path, model, pixel_integration)
 
 
 def psf_about_ray(
@@ -117,7 +109,7 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
-    return _in_precision_of(camera, _psf, *resolve(camera, path, method))
+    return _computed(_psf, camera, path, method)
 
 
 def spectral_psf(
@@ -164,9 +156,7 @@ def otf(
     **See also**: `psf`, `lensless.phase_shift.fringe_scanned_otf`.
     """
     path = camera.path(wavelength, object_distance, at)
-    return _in_precision_of(
-        camera, _otf, *resolve(camera, path, as_method(model, pixel_integration))
-    )
+    return _computed(_otf, camera, path, model, pixel_integration)
 
 
 @checked
@@ -203,7 +193,7 @@ def mtf(
     print(contrast.shape)  # (2,)
     ```
 
-    **See also**: `otf`, `plot.otf`, `design.transfer.modulation_transfer`.
+    **See also**: `otf`, `plot.otf`, `design.ranking.modulation_transfer`.
     """
     grid = camera.sensor.grid
     given = jnp.linspace(0.0, 0.5, 64) / grid.pitch if frequencies is None else frequencies
@@ -212,7 +202,7 @@ def mtf(
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
     path = camera.path(wavelength, object_distance)
-    h = _in_precision_of(camera, _psf, *resolve(camera, path, as_method(model, pixel_integration)))
+    h = _computed(_psf, camera, path, model, pixel_integration)
     return _contrast(h, grid, rho)
 
 
@@ -290,11 +280,17 @@ def _otf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def _in_precision_of(camera: LenslessCamera, function, *resolved):
-    """Value of a function of what `resolve` gives, in the camera's precision."""
-    *numbers, method = resolved
+def _computed(
+    function,
+    camera: LenslessCamera,
+    path: LightPath,
+    model: Model | PsfMethod,
+    pixel_integration: bool = True,
+):
+    """`function` of what `resolve` gives, in the camera's precision."""
+    *numbers, method = resolve(camera, path, model, pixel_integration)
     with allow(method.float_type, *numbers):
-        result = function(*resolved)
+        result = function(*numbers, method)
     own = precision_of(camera.sensor.pitch)
     return result if method.precision == own else cast(result, own)
 

@@ -19,7 +19,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import Quantity
-from thincam_jax.imaging.display import jpeg_bytes, png_bytes
+from thincam_jax.imaging.encoding import jpeg_bytes, png_bytes
 from thincam_jax.imaging.metrics import align, psnr
 from thincam_jax.imaging.metrics.mtf import cut_off, first_common_zero, low_frequency_value
 from thincam_jax.imaging.scene import ImagePlane, Scene

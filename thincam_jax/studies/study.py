@@ -21,9 +21,9 @@ from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, edge_frequency
 from thincam_jax.lensless.method import Model
-from thincam_jax.lensless.propagation.obliquity import psf_change
+from thincam_jax.lensless.propagation.path import psf_change
 from thincam_jax.lensless.psf import psf
-from thincam_jax.lensless.sampling import unresolved
+from thincam_jax.lensless.resolve import unresolved
 from thincam_jax.reconstruction import synthesis as syntheses
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.solver import AbstractSolver

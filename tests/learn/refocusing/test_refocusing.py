@@ -11,13 +11,17 @@ from refocusing_scores import flat_scene, multiscale_ssim, scores, sub_aperture_
 
 import thincam_jax as tc
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.learn.refocusing.lens_blur import lens_blur
-from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork, explain
 from thincam_jax.learn.refocusing.planes import Planes
-from thincam_jax.learn.refocusing.scenes import LayeredScene, SceneOptions, captured, draw_batch
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.refocusing.scenes import (
+    LayeredScene,
+    SceneOptions,
+    captured,
+    draw_batch,
+    lens_blur,
+)
+from thincam_jax.learn.refocusing.sources import dead_leaves, photographs
+from thincam_jax.learn.refocusing.train import examples, loss, relative_error
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.units import nm, um
 
@@ -114,19 +118,6 @@ def test_layers_hide_each_other(camera):
     np.testing.assert_allclose(
         seen, camera.operator(1 / scene.inverse[1:, 1])(jnp.sum(emission[1:], axis=1)), atol=1e-9
     )
-
-
-@pytest.mark.thorough
-def test_batches_are_those_of_their_key(camera, images):
-    batch = draw(camera, images)
-    again = draw(camera, images)
-    jax.tree.map(np.testing.assert_array_equal, batch, again)
-    other = draw(camera, images, seed=1)
-    assert not np.array_equal(batch.capture, other.capture)
-    assert np.all((batch.commanded >= 50 - 1e-6) & (batch.commanded <= 200 + 1e-6))
-    assert np.all((batch.distance > 49) & (batch.distance < 201))
-    for n, distance in enumerate(batch.commanded):
-        np.testing.assert_allclose(batch.target(camera, distance)[n], batch.image[n], atol=1e-9)
 
 
 @pytest.mark.thorough

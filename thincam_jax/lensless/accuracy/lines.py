@@ -23,7 +23,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     spherical_wave,
 )
 from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum
 
 # Rows and columns that are looked at. All sizes have this many, so that nothing recompiles.
 COUNT = 256

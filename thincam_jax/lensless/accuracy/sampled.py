@@ -49,8 +49,8 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
 )
 from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import PROFILE_ERROR, profile_samples, radial
-from thincam_jax.lensless.propagation.separable_field import separable_image
-from thincam_jax.lensless.sampling import samples_needed
+from thincam_jax.lensless.propagation.separable import separable_image
+from thincam_jax.lensless.resolve import samples_needed
 
 # Of the mask's middle, along each axis; the window of a PSF, and one that cuts nothing of note.
 _LINES, _PADDED = 12, (PADDING, 4 * PADDING)

@@ -15,8 +15,6 @@ from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, precision_o
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.cost import Cost, psf_cost
-from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
 from thincam_jax.lensless.method import (
     SAMPLED,
@@ -28,9 +26,9 @@ from thincam_jax.lensless.method import (
     parts_of,
     psf_method,
 )
-from thincam_jax.lensless.propagation.obliquity import require_off_axis
+from thincam_jax.lensless.propagation.path import require_off_axis
 from thincam_jax.lensless.propagation.skew import corner_error
-from thincam_jax.lensless.resolve import sampled_off_axis
+from thincam_jax.lensless.resolve import Cost, held_in_single, psf_cost, sampled_off_axis
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.

@@ -14,7 +14,7 @@ from thincam_jax.lensless.masks.base import (
 )
 from thincam_jax.lensless.propagation.chirp import chirp_average
 from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum
 
 
 def geometric(
