@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
