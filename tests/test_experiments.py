@@ -16,10 +16,6 @@ from helpers import ROOT
 SCRIPTS = sorted((ROOT / "experiments").glob("*.py"))
 
 
-def test_the_scripts_are_there():
-    assert {"first_image", "superresolution", "speed_for_accuracy"} <= {s.stem for s in SCRIPTS}
-
-
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_a_script_begins_with_a_title(script):
     """Of reStructuredText, and a question or subject that fits below a thumbnail."""

@@ -177,49 +177,6 @@ def test_a_scene_wider_than_the_field():
         assert likeness > 0.9 or "outside of the field: give field_shape=" in result.reason
 
 
-@pytest.mark.thorough
-def test_psf_and_capture_swapped(image_of, tmp_path):
-    given = pair(spots(SHAPE))
-    _, said = image_of(psf=given["capture"], capture=given["psf"])
-    assert said["swapped"]["severe"]
-    words = ["reconstruct", "--strict", "--out", str(tmp_path / "b.npy")]
-    files = ["--psf", str(tmp_path / "psf.tif"), "--capture", str(tmp_path / "capture.tif")]
-    result = CliRunner().invoke(cli.app, words + files)
-    assert result.exit_code == 2 and "exchange --psf and --capture" in result.stderr
-
-
-@pytest.mark.thorough
-def test_hot_pixels_in_a_psf(image_of):
-    given = pair(spots(SHAPE))
-    best = quality(image_of(**given)[0], TRUE)
-    given["psf"].flat[np.random.default_rng(3).choice(TRUE.size, 15, replace=False)] = FULL
-    image, said = image_of(psf=given["psf"])
-    assert quality(image, TRUE) > best - WITHIN and "replaced" in said
-
-
-@pytest.mark.thorough
-def test_a_background_for_each_capture(tmp_path):
-    """As a folder beside that of the captures: ambient light of a gradient each."""
-    light, slope = cells(SHAPE, size=3), np.linspace(0.2, 1, SHAPE[1])
-    for name in ("captures", "backgrounds"):
-        (tmp_path / name).mkdir()
-    tifffile.imwrite(tmp_path / "psf.tif", counts(light, 1))
-    for n in range(2):
-        ambient = np.round((500 + 300 * n) * slope * np.ones(SHAPE))
-        clean = counts(seen(TRUE, light), n, 2400)
-        for name, image in (("captures", clean + ambient), ("backgrounds", DARK + ambient)):
-            tifffile.imwrite(tmp_path / name / f"{n}.tif", image.astype(np.uint16))
-    scores = []
-    for more in ([], ["--background", str(tmp_path / "backgrounds")]):
-        files = ["--psf", str(tmp_path / "psf.tif"), "--capture", str(tmp_path / "captures")]
-        words = ["reconstruct", *files, *more, "--out", str(tmp_path / f"out{len(more)}")]
-        result = CliRunner().invoke(cli.app, [*words, "--iterations", "60"])
-        assert result.exit_code == 0, result.output
-        images = [np.load(tmp_path / f"out{len(more)}" / f"{n}.npy") for n in range(2)]
-        scores.append([quality(image, TRUE) for image in images])
-    assert min(scores[1]) > max(scores[0])
-
-
 @pytest.mark.parametrize("name", [*WRITERS, "a.pgm", "a.raw10", "a.raw12"])
 def test_formats_of_a_laboratory(tmp_path, name):
     """The counts, or one line that gives the Python that reads them."""

@@ -151,14 +151,6 @@ def test_whole_lossy_files_are_read(tmp_path):
     assert np.abs(read_image(path).pixels.astype(float) - smooth).max() < 40
 
 
-def test_small_palettes_and_bits(tmp_path):
-    """Pictures, though no captures, whose rows do not end with a byte."""
-    for mode in ("1", "P"):
-        image = PIL.Image.fromarray(GREY).convert(mode)
-        (tmp_path / "a.png").write_bytes(saved(image, "PNG", bits=1 if mode == "1" else 4))
-        assert tc.load_image(tmp_path / "a.png").shape[:2] == SHAPE
-
-
 def test_packed_images_have_a_largest_size(tmp_path, monkeypatch):
     monkeypatch.setattr(image_files, "_MOST_PIXELS", GREY.size - 1)
     flat = np.zeros(SHAPE, np.uint8)

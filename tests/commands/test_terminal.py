@@ -157,12 +157,3 @@ def test_what_a_line_advises_can_be_followed(line, wrong, advice, right, tmp_pat
     assert advice in one_line(started(wrong))
     end = started(right)
     assert end.exit_code == 0, end.output
-
-
-def test_a_log_gets_lines_where_a_bar_cannot_move(capsys):
-    with terminal.progress_bar() as bar, terminal.lines_in_a_log(bar, every=0.001):
-        bar.add_task("search", total=7, completed=2)
-        text = ""
-        while "search" not in text:
-            text += capsys.readouterr().err
-    assert "thincam: search (2 of 7), 0 s\n" in text

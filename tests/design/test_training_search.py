@@ -75,13 +75,6 @@ def test_descents_begin_at_the_best_points_apart(problem):
     assert {bool(b > 21) for b in betas[:, 0]} == {True, False}  # a start in either basin
 
 
-def test_the_base_and_designs_of_the_search_can_be_starts(problem):
-    starts, count = starts_of(problem.space, TrainingSettings(samples=1, starts=10), [0.18, 0.16])
-    assert count == 3 >= len(starts)  # the sample may meet NaN
-    assert np.asarray(starts[0]) == pytest.approx([0.18, 0.16])
-    assert any(np.allclose(problem.space.values(p), [25.0, 21.0]) for p in starts)
-
-
 def test_the_base_lies_in_the_cube():
     """With a free width, too, where the widest mask leaves β no room."""
 

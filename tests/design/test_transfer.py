@@ -108,12 +108,6 @@ def test_of_even_responses_in_closed_form(monkeypatch):
     assert found.channels.shape == (2, 64)
 
 
-@pytest.mark.thorough
-def test_differences_are_named_by_what_is_added():
-    scanned = np.array([[0.0, -1.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 0.0]])
-    assert modulation_transfer(DESIGN, data(synthesis=scanned)).sums == (((4,), (2,)), ((1,), ()))
-
-
 def test_rings_without_the_even_light_are_refused():
     with pytest.raises(TypeError, match="give a Quadrant"):
         polar = Polar(jnp.asarray(HIGHEST), 64, 1)

@@ -1,5 +1,8 @@
-"""Discovery: what is found, that nothing is changed by looking, and what a port answers."""
+"""Devices: what is found by looking, and who holds one."""
 
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +12,7 @@ from commands.test_cli import call, one_line
 from thincam_jax.hardware import registry
 from thincam_jax.hardware.base import Busy, CameraSettings, Connected, Device, NotFound
 from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
+from thincam_jax.hardware.holder import held, holder
 from thincam_jax.hardware.virtual.grbl import VirtualGrbl
 from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 from thincam_jax.hardware.virtual.zaber import VirtualZaber
@@ -92,12 +96,6 @@ def test_a_grbl_machine_reports_its_state():
         assert set(stage.received.split()) <= {b"?"}
 
 
-def test_nothing_and_no_port(tmp_path):
-    with pytest.raises(NotFound):
-        registry.ask_port(str(tmp_path / "none"))
-    assert "no serial port that works" in one_line(call("doctor", "--ask", tmp_path / "none"))
-
-
 def test_a_driver_of_another_package_finds_its_own(monkeypatch):
     class Eye(Device):
         @classmethod
@@ -113,3 +111,59 @@ def test_a_driver_of_another_package_finds_its_own(monkeypatch):
     lines = result.stdout.splitlines()
     assert "camera eye {serial: 7}: Elsewhere Eye" in lines
     assert "serial port {port: /dev/ttyUSB0}: USB serial" in lines
+
+
+HOLD = """\
+import sys
+from thincam_jax.hardware.holder import held
+with held(sys.argv[1]):
+    print(flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_the_process_that_has_a_file_open_is_named(tmp_path):
+    path = tmp_path / "device"
+    path.touch()
+    code = "import sys; file = open(sys.argv[1]); print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert f"(process {process.pid})" in holder(str(path), others=True)
+        process.communicate()
+    assert holder(str(path)) == "another program"
+    with path.open():
+        assert f"(process {os.getpid()})" in holder(str(path))
+        assert holder(str(path), others=True) == "another program"
+
+
+def test_a_device_is_held_by_one_process_until_that_ends(tmp_path, monkeypatch):
+    """Also one that is killed; other devices are free."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    command = [sys.executable, "-c", HOLD, "eye {serial: 1}"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        who = rf"eye .serial: 1.: open: .* \(process {process.pid}\) has held it since \d\d:\d\d"
+        with pytest.raises(Busy, match=who), held("eye {serial: 1}"):
+            pass
+        with held("eye {serial: 2}"):
+            pass
+        process.kill()
+    with held("eye {serial: 1}"), pytest.raises(Busy, match=str(os.getpid())):
+        with held("eye {serial: 1}"):
+            pass
+
+
+def test_nothing_and_no_port(tmp_path):
+    with pytest.raises(NotFound):
+        registry.ask_port(str(tmp_path / "none"))
+    assert "no serial port that works" in one_line(call("doctor", "--ask", tmp_path / "none"))
+
+
+def test_without_a_place_for_locks_devices_are_not_held(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "file"))
+    with held("eye"), held("eye"):
+        pass

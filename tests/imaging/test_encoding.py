@@ -114,17 +114,6 @@ def test_photographs_stand_upright(tmp_path, orientation, name):
     np.testing.assert_array_equal(upright(smooth, orientation).shape, turned.shape)
 
 
-def test_a_comparison_shows_the_codes_of_a_photograph(tmp_path):
-    """Decoded once and encoded once."""
-    codes = CODES.copy()
-    codes.ravel()[0] = 255
-    PIL.Image.fromarray(codes).save(tmp_path / "a.png")
-    assert np.array_equal(eight_bit(tc.load_image(tmp_path / "a.png"), percentile=100), codes)
-    (panel,) = tc.plot.compare({"photo": tc.load_image(tmp_path / "a.png")}).axes
-    shown = np.asarray(panel.images[0].get_array(), int)
-    assert np.abs(shown - codes).max() <= 3  # white is the 99.9th percentile
-
-
 def test_codes_as_data_where_the_file_is_a_mask(tmp_path):
     PIL.Image.fromarray(np.maximum(CODES, 1)).save(tmp_path / "mask.png")
     mask = tc.read_mask(tmp_path / "mask.png", 0.03)

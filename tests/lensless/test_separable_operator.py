@@ -55,16 +55,6 @@ def test_a_mask_of_many_terms_has_an_operator():
 
 
 @pytest.mark.thorough
-def test_single_precision_stays():
-    with jax.enable_x64(False):
-        found = tc.separable_operator(camera(dtype=jnp.float32), scene(550 * nm), tolerance=1e-6)
-        assert found.operator.left.dtype == jnp.float32
-        got = found.operator(jnp.asarray(IMAGE, jnp.float32))
-    expected = tc.capture(camera(), scene(550 * nm))
-    assert relative_l2(got, expected) < 3e-5
-
-
-@pytest.mark.thorough
 def test_the_gradient_goes_through():
     """With all terms: their number cannot follow from traced numbers."""
 

@@ -23,7 +23,6 @@ from thincam_jax.reconstruction.implicit_gradient import (
     implicit_proximal_gradient,
     solve_fixed_point,
 )
-from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.regularisers import Cosines, Sparsity
 from thincam_jax.reconstruction.splittings import splitting_of
 from thincam_jax.units import nm
@@ -141,15 +140,6 @@ def test_the_gradient_of_a_psnr_by_differences(name):
     assert slope == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.thorough
-def test_new_values_compile_nothing():
-    _, gradient, counted = compiled()
-    for factor in (1.0, 1.01):
-        slopes = gradient(jax.tree.map(lambda x, f=factor: f * x, parameters()))
-    assert counted.traces == 1
-    assert all(bool(jnp.isfinite(s).all()) for s in jax.tree.leaves(slopes))
-
-
 def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
     result = solve_fixed_point(
         splitting_of(problem).with_penalties(tuned(problem, factor)),
@@ -255,23 +245,6 @@ def test_the_series_solves_linear_systems():
     np.testing.assert_array_equal(none.value, 0.0)
 
 
-@pytest.mark.thorough
-def test_single_precision_has_a_gradient():
-    """Finite, and that of double precision to a few per cent."""
-    problem, _ = scenes.problem(captures=1, tau=0.05)
-
-    def total(tau, problem):
-        other = eqx.tree_at(lambda p: p.tau, problem, tau)
-        first = jnp.zeros(other.image_shape, other.tau.dtype)
-        result = solve_fixed_point(other, first, iterations=200, tolerance=1e-7, relaxation=1.8)
-        return jnp.sum(result.image**2)
-
-    small = scenes.single(problem)
-    value = jax.grad(total)(small.tau, small)
-    assert value.dtype == jnp.float32
-    assert float(value) == pytest.approx(float(jax.grad(total)(problem.tau, problem)), rel=0.03)
-
-
 def zeros(problem):
     return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
 
@@ -286,14 +259,6 @@ def sparse(tau):
         nonnegative=False,
         regulariser=Sparsity(Cosines()),
     )
-
-
-@pytest.mark.thorough
-def test_with_a_proximal_map_in_closed_form_it_is_the_minimum_of_fista():
-    problem, _ = sparse(0.05)
-    own = solve_fista(problem, iterations=800, tolerance=1e-10)
-    image = implicit_proximal_gradient(problem, zeros(problem), iterations=2000, tolerance=1e-12)
-    assert relative_l2(image, own.image) < 1e-6
 
 
 @pytest.mark.thorough

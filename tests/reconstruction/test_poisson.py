@@ -219,21 +219,6 @@ def test_the_tau_of_counts_is_that_of_their_mean():
 
 
 @pytest.mark.thorough
-def test_poisson_of_few_counts():
-    """Three a pixel: never negative, with its background as a frame; goes on from a start."""
-    captures, psfs, truth = recording(3.0, background=1.0)
-    seen = tc.Recording(captures, psfs)
-    likely = tc.reconstruct(seen, tc.PoissonTV(background=jnp.ones_like(captures)))
-    assert float(likely.image.min()) >= 0
-    assert likely.status in ("converged", "iterations_exhausted")
-    assert relative_l2(likely.image, truth) < 0.15
-    again = tc.reconstruct(seen, tc.PoissonTV(background=1.0), start=likely.image)
-    assert again.history[0].objective < likely.history[0].objective
-    negative = tc.Recording(captures - 50.0, psfs)
-    rig.refused("negative counts", lambda: tc.reconstruct(negative, tc.PoissonTV()))
-
-
-@pytest.mark.thorough
 def test_poisson_with_cameras_is_upright():
     """From a start given upright, too: that of the result is left after a step or two."""
     clean = rig.captures(rig.pair(), rig.picture())

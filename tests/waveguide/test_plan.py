@@ -185,8 +185,3 @@ def test_errors(scene, change, error, message):
     given = {"camera": thin(5.0), "scene": scene, "tolerance": 0.1} | change
     with pytest.raises(error, match=message):
         wg.plan_screen(given["camera"], given["scene"], tolerance=given["tolerance"])
-
-
-def test_a_dark_image_is_refused():
-    with pytest.raises(ValueError, match="image is dark, and errors are relative"):
-        LitPlane(wg.ObjectPlane(CELLS, 550.0, 150.0, (27.0, 0.0)), np.zeros(CELLS))

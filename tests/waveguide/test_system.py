@@ -82,12 +82,6 @@ def test_images_come_back(name, least):
     assert psnr(np.squeeze(np.asarray(found.image)), image) > least
 
 
-def test_cells_that_are_too_small_are_refused():
-    fine = wg.ObjectPlane((500, 500), 550.0, 20.0, (27.0, 0.0))
-    with pytest.raises(ValueError, match="a pixel sees 164.* cells.*give cells of at least"):
-        wg.system_operator(small(), fine)
-
-
 COLOURS = ((630 * nm, 60 * deg), (532 * nm, 61.2 * deg), (460 * nm, 62.5 * deg))
 
 
@@ -154,3 +148,9 @@ def test_planes_add_up():
     np.testing.assert_allclose(both, sum(each), atol=1e-14)
     with pytest.raises(ValueError, match=r"planes have \[\(12, 16\), \(9, 8\)\] cells; give"):
         wg.system_operator(small(), [plane(), plane((9, 8))])
+
+
+def test_cells_that_are_too_small_are_refused():
+    fine = wg.ObjectPlane((500, 500), 550.0, 20.0, (27.0, 0.0))
+    with pytest.raises(ValueError, match="a pixel sees 164.* cells.*give cells of at least"):
+        wg.system_operator(small(), fine)

@@ -45,17 +45,6 @@ def test_a_mask_may_be_a_rectangle(tmp_path):
     assert told.startswith("the mask casts 13.5 cycles/mm on pixels that resolve 12.5")
 
 
-def test_the_same_shot_twice_and_longer(tmp_path):
-    """Another exposure is another capture; the same one would count its noise twice."""
-    _, method = pairs(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}")
-    assert len(set(method.exposures)) == 4
-    with pytest.raises(ConfigError, match="shots hold an entry twice"):
-        pairs(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, width: 2000 um}")
-    longer = "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}"
-    with pytest.raises(ConfigError, match="shots hold an entry twice"):
-        pairs(tmp_path, longer, "methods.1.synthesis=contrasts")
-
-
 def test_a_second_take_has_noise_of_its_own(tmp_path):
     """Of one camera, which sees the same without noise."""
     again = "{beta: 25 /mm^2, distance: 3 mm, take: 2}"

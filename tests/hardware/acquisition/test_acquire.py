@@ -327,16 +327,6 @@ def test_what_is_no_frame_is_one_line_and_nothing_is_lost(path, monkeypatch, kin
     require_whole(path)
 
 
-def test_a_frame_that_does_not_come_once_is_taken_again(path, monkeypatch):
-    world, taken = World(), MemoryCamera.trigger_and_grab
-    count = iter(range(99))
-    once = lambda self, timeout: taken(self, timeout) if next(count) != 5 else None  # noqa: E731
-    monkeypatch.setattr(MemoryCamera, "trigger_and_grab", once)
-    done = run(world, path)
-    assert done.complete and len(done.recovered) == 1 and "IncompleteFrame" in done.recovered[0]
-    require_whole(path)
-
-
 def test_the_exposure_is_found_once(path):
     wanted = AutoExposure(target=0.3, longest=0.05)
     procedure = dataclasses.replace(QUICK, exposure="auto", auto_exposure=wanted)
@@ -436,15 +426,6 @@ def test_a_frame_that_comes_too_late_is_no_other_steps_frame(path):
     ) as rig:  # fmt: skip
         done = acquire(PLAN, rig, path, procedure=Procedure(timeout=0.02))
     assert len(done.recovered) == 1
-    require_whole(path)
-
-
-def test_the_first_frame_may_fail_too(path):
-    """A short one says nothing of the shape, which the store is made for."""
-    world = World()
-    for fault in ("short_frame", "dropped_frame", "unplug"):
-        world.faults.inject(fault)
-    assert len(run(world, path).recovered) == 3 and not world.faults.waiting()
     require_whole(path)
 
 

@@ -110,11 +110,6 @@ def test_a_camera_that_renames_its_format_at_an_odd_place_is_seen(camera, monkey
         camera.configure(CameraSettings(1e-3, Region(2, 5, 8, 12), "BayerRG12"))
 
 
-def test_without_a_region_the_whole_sensor(camera):
-    assert camera.configure(CameraSettings(1e-3)).region == Region(0, 0, *SENSOR)
-    assert camera.trigger_and_grab(TIMEOUT).pixels.shape == SENSOR
-
-
 @pytest.mark.parametrize(
     ("settings", "allowed"),
     [

@@ -7,7 +7,7 @@ import thincam_jax as tc
 from thincam_jax.hardware.acquisition.plan import BLACK, Pattern
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
-from thincam_jax.hardware.plans import levels_pattern, pictures, zone_plate
+from thincam_jax.hardware.plans import pictures, zone_plate
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 PITCH = 0.036  # mm, the modulator of the thesis
@@ -53,14 +53,6 @@ def test_zones_are_those_of_the_formula(profile):
         assert set(np.unique(pattern)) == {0, 255}
 
 
-def test_a_printed_masks_pattern_and_its_complement():
-    mask = tc.FresnelZoneAperture(beta=12.0, phase=0.0, width=0.7, profile="intensity")
-    other = tc.FresnelZoneAperture(beta=12.0, phase=np.pi, width=0.7, profile="intensity")
-    both = [mask_pattern(m, SHAPE, PITCH).astype(int) for m in (mask, other)]
-    inner = slice(3, -3), slice(12, -12)
-    assert np.abs(sum(both)[inner] - 255).max() <= 1
-
-
 def test_cells_are_squares_of_pixels():
     mask = tc.SeparableMask([1, 0, 1], [0, 1, 1, 0.5], 4 * PITCH)
     expected = np.zeros(SHAPE)
@@ -81,16 +73,6 @@ def test_cells_are_squares_of_pixels():
 def test_masks_that_do_not_fit(mask, pitch, message):
     with pytest.raises(ValueError, match=message):
         mask_pattern(mask, SHAPE, pitch)
-
-
-def test_cells_are_the_largest_that_fit():
-    series = HadamardSeries(object_shape=(2, 8), dark_frames=1)
-    for number in range(series.frame_count):
-        expected = np.zeros(SHAPE)
-        expected[7:17] = np.kron(255 * series.frame(number), np.ones((5, 5)))
-        np.testing.assert_array_equal(on_cells(255 * series.frame(number), SHAPE), expected)
-    with pytest.raises(ValueError, match="do not fit into 24 × 40"):
-        on_cells(np.zeros((32, 32), np.uint8), SHAPE)
 
 
 def test_levels_of_the_patterns_of_a_plan():
@@ -117,16 +99,6 @@ def test_a_picture_is_the_one_of_the_plan():
     for other in ({}, {"own": picture ^ 1}, {"own": picture.reshape(8, 4)}):
         with pytest.raises(ValueError, match="the picture 'own' is not the one of the plan"):
             pattern_levels(shown, SHAPE, PITCH, other)
-
-
-def test_levels_of_pixels_are_in_the_middle_one_to_one():
-    levels = np.random.default_rng(0).integers(0, 256, (6, 9), np.uint8)
-    pattern = levels_pattern("lens", levels)
-    shown = pattern_levels(pattern, SHAPE, PITCH, {"lens": levels})
-    np.testing.assert_array_equal(shown[9:15, 15:24], levels)
-    assert shown.sum() == levels.sum(dtype=int) and pattern.label == "lens"
-    with pytest.raises(ValueError, match="6 × 9 cells do not fit into 5 × 40 pixels"):
-        pattern_levels(pattern, (5, 40), PITCH, {"lens": levels})
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (41, 61)])

@@ -49,21 +49,6 @@ def test_standard_line_pairs():
         assert frequency == pytest.approx(2 ** (group + (element - 1) / 6), rel=1e-12)
 
 
-def test_line_pair_scales_with_the_chart():
-    element = usaf1951_elements()[0]
-    assert line_pair(element, 10.0) == pytest.approx(2 * element.bar * 10.0)
-    with pytest.raises(ValueError, match="width = 0"):
-        line_pair(element, 0)
-
-
-def test_first_group_only_labels():
-    standard, other = usaf1951_elements(2), usaf1951_elements(2, first_group=4)
-    assert [(e.centre, e.bar) for e in standard] == [(e.centre, e.bar) for e in other]
-    assert [e.group + 6 for e in standard] == [e.group for e in other]
-    with pytest.raises(ValueError, match="first_group = 1"):
-        usaf1951_elements(2, first_group=1)
-
-
 def test_nothing_overlaps_and_a_margin_stays_free():
     boxes = [box(e) for e in usaf1951_elements(3)]
     for a, b in combinations(boxes, 2):
@@ -89,29 +74,6 @@ def test_the_layout_is_the_standard_one():
     inner = [box(e) for (group, _), e in where.items() if group >= 0]
     assert min(b[2] for b in inner) > min(b[3] for b in outer)  # the next layer lies in the middle
     assert max(b[1] for b in inner) < max(b[0] for b in outer)
-
-
-def test_the_next_layer_is_the_same_a_quarter_as_large():
-    elements = usaf1951_elements(2)
-    outer, inner = elements[:24], elements[24:]
-    shifts = np.array(
-        [np.subtract(b.centre, np.divide(a.centre, 4)) for a, b in zip(outer, inner, strict=True)]
-    )
-    assert np.allclose(shifts, shifts[0], atol=1e-15)
-    assert [b.bar * 4 for b in inner] == pytest.approx([a.bar for a in outer], rel=1e-14)
-
-
-@pytest.mark.parametrize("shape", [(101, 237), (240, 67), (333, 334), (64, 65)])
-@pytest.mark.parametrize("layers", [1, 3])
-def test_total_is_the_area_of_the_bars(shape, layers):
-    """Three bars of w by 5w in each set, and a square of 5 by 5 bars in each layer."""
-    bars = sum(15 * e.bar**2 for e in usaf1951_elements(layers))
-    squares = sum((5 / 32 / 4**layer) ** 2 for layer in range(layers))
-    area = (bars + squares) * min(shape) ** 2
-    assert usaf1951(shape, layers=layers).sum() == pytest.approx(area, rel=1e-12)
-    dark = usaf1951(shape, layers=layers, polarity="dark_on_bright")
-    assert dark.sum() == pytest.approx(shape[0] * shape[1] - area, rel=1e-12)
-    assert dark[0, 0] == 1.0
 
 
 def test_the_centroid_is_that_of_the_elements():
@@ -147,19 +109,6 @@ def test_the_spectrum_of_a_set_peaks_at_its_frequency(element):
     assert along == pytest.approx(0.0, abs=1e-12)  # constant along the bars
 
 
-def test_bars_of_element_1_lie_on_whole_pixels():
-    image = usaf1951((512, 600), layers=3)
-    profile, _ = crop(image, usaf1951_elements(3)[24], 512)
-    assert profile[:20].tolist() == ([1.0] * 4 + [0.0] * 4) * 2 + [1.0] * 4
-
-
-def test_pixels_per_chart_only_scales():
-    """A chart of 96 pixels in a larger image is the chart of 96 pixels with a border."""
-    large = usaf1951((120, 150), layers=2, pixels_per_chart=96)
-    assert np.allclose(large[12:-12, 27:-27], usaf1951((96, 96), layers=2), atol=1e-12)
-    assert large.sum() == pytest.approx(large[12:-12, 27:-27].sum())
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -172,3 +121,11 @@ def test_pixels_per_chart_only_scales():
 def test_errors_name_the_argument(arguments, message):
     with pytest.raises(ValueError, match=message):
         usaf1951(**arguments)
+
+
+def test_first_group_only_labels():
+    standard, other = usaf1951_elements(2), usaf1951_elements(2, first_group=4)
+    assert [(e.centre, e.bar) for e in standard] == [(e.centre, e.bar) for e in other]
+    assert [e.group + 6 for e in standard] == [e.group for e in other]
+    with pytest.raises(ValueError, match="first_group = 1"):
+        usaf1951_elements(2, first_group=1)

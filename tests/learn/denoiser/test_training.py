@@ -62,13 +62,6 @@ def test_tiles_cover_a_picture_at_several_scales(tmp_path):
         split(found, ["ramps"])
 
 
-def test_drawn_pictures_are_the_same_for_the_same_seed():
-    one = drawn(0, 4).tiles
-    assert (one == drawn(0, 4).tiles).all() and (one != drawn(2, 4).tiles).any()
-    assert one.shape == (4, TILE, TILE, 3) and one.min() >= 0 and one.max() <= 1
-    assert (one.std(axis=(1, 2, 3)) > 0.01).all()
-
-
 @pytest.fixture(scope="module")
 def whole():
     return train_denoiser(untrained(), LESSONS, OPTIONS)

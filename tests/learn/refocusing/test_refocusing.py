@@ -121,19 +121,6 @@ def test_layers_hide_each_other(camera):
 
 
 @pytest.mark.thorough
-def test_batches_are_those_of_their_key(camera, images):
-    batch = draw(camera, images)
-    again = draw(camera, images)
-    jax.tree.map(np.testing.assert_array_equal, batch, again)
-    other = draw(camera, images, seed=1)
-    assert not np.array_equal(batch.capture, other.capture)
-    assert np.all((batch.commanded >= 50 - 1e-6) & (batch.commanded <= 200 + 1e-6))
-    assert np.all((batch.distance > 49) & (batch.distance < 201))
-    for n, distance in enumerate(batch.commanded):
-        np.testing.assert_allclose(batch.target(camera, distance)[n], batch.image[n], atol=1e-9)
-
-
-@pytest.mark.thorough
 def test_untrained_it_renders_the_linear_estimate_of_all_planes(camera, images):
     """What a lens sees of the estimate, in the capture's unit and with its light."""
     network = RefocusNetwork.create(camera, SMALL, key=jax.random.key(0))
