@@ -18,6 +18,7 @@ from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix
 from thincam_jax.imaging.operators.low_rank import LowRank
+from thincam_jax.reconstruction.assembly import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.coarse import coarsened, finer
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
@@ -26,7 +27,6 @@ from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedul
 from thincam_jax.reconstruction.other_psf import better_psf
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
-from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.proximal_gradient import solve_fista

@@ -26,15 +26,16 @@ from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import resize
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.reconstruction.depth.find import (
+    MEASURES,
     DepthMap,
     FocusCurves,
     FocusPeak,
+    Measure,
     all_in_focus,
     depth_map,
     find_distances,
     object_regions,
 )
-from thincam_jax.reconstruction.depth.focus import MEASURES, Measure
 from thincam_jax.reconstruction.depth.refocus import (
     RefocusSweep,
     axial_resolution,

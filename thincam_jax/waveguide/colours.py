@@ -33,7 +33,6 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import AccuracyWarning, product
 from thincam_jax._core.quantity import quantity
@@ -149,19 +148,6 @@ class ColourCamera(Module):
         rays = counts[0], *pixels.shape[:-1], counts[1]
         points = jnp.moveaxis(points, 0, 2).reshape(-1, *rays, 2)
         return points, jnp.moveaxis(weight, 0, 3).reshape(-1, *self.channels, *rays)
-
-    def efficiencies(
-        self, tangential: Numbers, wavelength: Numbers
-    ) -> Float[Array, "grating *ray"]:
-        """C of each, unpolarised, for light from air with direction cosines (x, y)."""
-        across = checks.points("tangential", tangential, "direction cosines (x, y)")
-        wave = jnp.asarray(checks.wavelengths("wavelength", wavelength), across.dtype)
-
-        def one(number, grating):
-            guided = across - wave[..., None] / (2 * jnp.pi) * grating[:2]
-            return self.coupled(guided, wave)[0][number].mean(axis=0)
-
-        return jax.vmap(one)(jnp.arange(len(self.cameras)), self.gratings.grating)
 
     def coupled(self, guided: Float[Array, "*ray 2"], wavelength: Float[Array, "*ray"]):
         """C of each, (grating, 2, *ray) for TE and TM, what stays guided, and directions t_k."""

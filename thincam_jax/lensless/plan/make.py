@@ -29,10 +29,11 @@ from thincam_jax.lensless.field import light_over_field, points_needed, tangents
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
+    has_few_terms,
     term_count,
     zone_orders,
 )
-from thincam_jax.lensless.method import PsfMethod, has_few_terms
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.choose import choose_planes, choose_psf, choose_wavelengths
 from thincam_jax.lensless.plan.run import CapturePlan, effects_of
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
