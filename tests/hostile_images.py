@@ -41,8 +41,7 @@ from thincam_jax.lensless.phase_shift import harmonic_otf
 from thincam_jax.measured import calibration
 from thincam_jax.measured.exposures import ExposedFrames, merge_exposures
 from thincam_jax.reconstruction import depth
-from thincam_jax.reconstruction.depth.find import depth_of_colours, object_regions
-from thincam_jax.reconstruction.depth.focus import focus_measure
+from thincam_jax.reconstruction.depth.find import depth_of_colours, focus_measure, object_regions
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 from thincam_jax.waveguide.measured.screen_fit import GhostPositions
 

@@ -23,7 +23,7 @@ from tools.mask_captures import (
     total_variation,
 )
 
-from thincam_jax._core.progress import Progress, Step, carry_out
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table, number
 from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.targets import resize

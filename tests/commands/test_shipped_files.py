@@ -26,6 +26,18 @@ def test_resolved_values(path):
     assert found == RESOLVED[path.stem]
 
 
+@pytest.mark.parametrize("stem", RESOLVED)
+def test_files_of_this_version_are_read_by_later_ones(stem, tmp_path):
+    """What a run keeps of its experiment, with every default written out, means the same."""
+    written = json.dumps(RESOLVED[stem]).replace('"configs/', f'"{ROOT}/configs/')
+    (tmp_path / "kept.yaml").write_text(written, "utf-8")
+    config = load_experiment(tmp_path / "kept.yaml", command=None)
+    data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
+    text = json.dumps(data).replace(str((ROOT / "configs").resolve()), "configs")
+    kept = {key: value for key, value in json.loads(text).items() if key not in ("title", "notes")}
+    assert kept == RESOLVED[stem]
+
+
 def test_every_file_is_recorded():
     assert sorted(RESOLVED) == [path.stem for path in FILES]
 

@@ -106,7 +106,10 @@ def test_regions_without_a_number(solver):
     """16 of 28 parts of the cube: counted among the samples, and the best is found beside them."""
     data = jnp.asarray(DEEPEST)
     result = run(holed, data, solver=solver)
-    np.testing.assert_allclose(result.found[0].values, DEEPEST, atol=0.1)
+    best = result.found[0]
+    np.testing.assert_allclose(best.values, DEEPEST, atol=0.1)
+    names = "β of shot 1, rad/mm²", "β of shot 2, rad/mm²"
+    assert best.named == dict(zip(names, np.asarray(best.values).tolist(), strict=True))
     assert abs(result.failed - 64 * 16 / 28) <= 8
     assert all(np.isfinite(f.objective) for f in result.found)
     nowhere = run(holed, data + jnp.nan, solver=solver)

@@ -14,6 +14,7 @@ from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import Length, section
 from thincam_jax.imaging.targets.images import load_image
 from thincam_jax.lensless import masks
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.display import on_display
@@ -26,7 +27,6 @@ from thincam_jax.lensless.masks.redundant_arrays import (
     SeparableMask,
 )
 from thincam_jax.lensless.masks.sampled import SampledMask, read_mask
-from thincam_jax.lensless.propagation.path import LightPath
 
 APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem, Objective
@@ -85,6 +86,7 @@ class Landscape:
 
 
 @checked
+@watched("computing the landscape")
 def landscape_around(
     problem: DesignProblem, design: Design, *, count: int = 61, at_a_time: int = AT_A_TIME
 ) -> Landscape:

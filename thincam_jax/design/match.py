@@ -31,6 +31,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.progress import watched
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import Channels, channels, ring_means
 from thincam_jax.design.search import (
@@ -195,6 +196,7 @@ class Match(Module):
 
 
 @checked
+@watched("matching the response")
 def match_response(
     model: ResponseModel, target: Numbers, settings: MatchSettings = MatchSettings(), *, key: Key
 ) -> Match:

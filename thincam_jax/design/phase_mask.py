@@ -38,11 +38,10 @@ from thincam_jax.design.stochastic import adam
 from thincam_jax.design.training import CaptureSum, relative_error
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.resolve import require_phase_sampling
 
 # Of the angle u, whose range from the lowest to the highest relief is π/2.
@@ -131,7 +130,7 @@ def contour_mask(
     ```python
     import thincam_jax as tc
     from thincam_jax.design.phase_mask import contour_mask
-    from thincam_jax.lensless.propagation.path import LightPath
+    from thincam_jax.lensless.camera import LightPath
 
     blank = tc.lensless.masks.MaskBlank((64, 64), 0.01, 1.52)
     mask = contour_mask(0, blank, LightPath(5e-4, 5.0), feature=0.08, line_width=0.02)

@@ -43,7 +43,7 @@ from thincam_jax._core.precision import product
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import PowerLaw
 from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
-from thincam_jax.lensless.propagation.path import LightPath
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
 from thincam_jax.reconstruction.synthesis import keep_bias
 from thincam_jax.reconstruction.wiener import crop_noise, inner_band, scene_power

@@ -8,6 +8,7 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
@@ -23,6 +24,7 @@ _ON_AXIS = (
 
 
 @checked
+@watched("capturing")
 def capture(
     camera: LenslessCamera,
     scene: Scene,

@@ -19,10 +19,9 @@ from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank, LowRankFit, principal_psfs
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.base import zone_orders
-from thincam_jax.lensless.method import Model, PsfMethod, as_method, has_few_terms
-from thincam_jax.lensless.propagation.path import ERROR_PER_RADIAN, shift_variance
+from thincam_jax.lensless.camera import ERROR_PER_RADIAN, LenslessCamera, shift_variance
+from thincam_jax.lensless.masks.base import has_few_terms, zone_orders
+from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes
 from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.lensless.resolve import AVERAGES

@@ -26,13 +26,12 @@ from thincam_jax._core.precision import (
     squared_modulus,
     turn_phasor,
 )
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.base import AbstractMask, require_factored
-from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, has_few_terms
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
+from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
+from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
 from thincam_jax.lensless.propagation.geometric import geometric
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import (

@@ -18,8 +18,13 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import allow, cast, itemsize_of, precision_of
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, term_count
+from thincam_jax.lensless.camera import LenslessCamera, LightPath, require_off_axis
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AbstractMask,
+    has_few_terms,
+    term_count,
+)
 from thincam_jax.lensless.masks.phase import PhaseMask
 from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import (
@@ -29,12 +34,10 @@ from thincam_jax.lensless.method import (
     Model,
     PsfMethod,
     as_method,
-    has_few_terms,
     odd_from,
     psf_method,
 )
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
-from thincam_jax.lensless.propagation.path import LightPath, require_off_axis
 from thincam_jax.lensless.propagation.radial import profile_length, profile_samples
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.skew import focuses_on_a_line

@@ -157,14 +157,18 @@ class Admm(optimistix.AbstractFixedPointSolver):
 
     - `rtol`: `AdmmState.change` must fall below it. `atol` and `norm` are not used.
     - `relaxation`: α, 0 < α < 2.
+    - `judged`: whether steps are judged, which takes half of the time to compile and a tenth of it
+      to run.
     """
 
     rtol: Any
     relaxation: Any
+    judged: bool = eqx.field(static=True)
     atol: float = eqx.field(static=True)
     norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
 
-    def __init__(self, rtol: Any, relaxation: Any = RELAXATION):
+    def __init__(self, rtol: Any, relaxation: Any = RELAXATION, *, judged: bool = True):
+        self.judged = judged
         # Arrays, so that another value does not recompile.
         self.rtol, self.relaxation = jnp.asarray(rtol), jnp.asarray(relaxation)
         self.atol, self.norm = 0.0, optimistix.rms_norm
@@ -178,7 +182,7 @@ class Admm(optimistix.AbstractFixedPointSolver):
         mapped, aux = fn(y, args)
         relaxation = self.relaxation.astype(y.image.dtype)
         after = jax.tree.map(lambda q, t: q + relaxation * (t - q), y, mapped)
-        return after, _judged(args, y, after, relaxation), aux
+        return after, _judged(args, y, after, relaxation) if self.judged else state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
         enough = state.change < self.rtol.astype(state.change.dtype)
@@ -215,7 +219,7 @@ def _judged(splitting: AbstractSplitting, before: State, after: State, relaxatio
 class AdmmMethod(OptimistixMethod):
     """ADMM for a problem and its splitting; residual balancing adapts the penalties.
 
-    - `relaxation`: α, 0 < α < 2.
+    - `relaxation`: α, 0 < α < 2. `judged`: see `Admm`; penalties do not adapt without.
     """
 
     problem: InverseProblem
@@ -224,10 +228,19 @@ class AdmmMethod(OptimistixMethod):
     donated = True
 
     def __init__(
-        self, problem: InverseProblem, splitting: AbstractSplitting, relaxation: Number = RELAXATION
+        self,
+        problem: InverseProblem,
+        splitting: AbstractSplitting,
+        relaxation: Number = RELAXATION,
+        *,
+        judged: bool = True,
     ):
         self.problem, self.arguments = problem, splitting
-        self.solver = Admm(0.0, relaxation)
+        self.solver = Admm(0.0, relaxation, judged=judged)
+
+    @property
+    def judged(self):
+        return self.solver.judged
 
     @staticmethod
     def function(value: State, arguments: AbstractSplitting):

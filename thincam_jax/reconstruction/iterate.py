@@ -114,11 +114,16 @@ class OptimistixMethod(AbstractMethod[SolverState]):
 
     - `solver`, and `arguments` of its function.
     - `donated`: whether the next state reuses the memory of the last.
+    - `judged`: whether the solver finds the residuals of its steps, else they are NaN.
     """
 
     solver: eqx.AbstractVar[Any]
     arguments: eqx.AbstractVar[Any]
     donated: ClassVar[bool] = False
+
+    @property
+    def judged(self) -> bool:
+        return True
 
     @staticmethod
     @abc.abstractmethod
@@ -144,6 +149,8 @@ class OptimistixMethod(AbstractMethod[SolverState]):
         return _image(self, state)
 
     def residuals(self, state: SolverState):
+        if not self.judged:
+            return Residuals(math.nan, math.nan)
         inside = jax.device_get(state.inside)
         parts = tuple((float(p), float(d)) for p, d in getattr(inside, "parts", ()))
         return Residuals(float(inside.primal), float(inside.dual), parts)
@@ -165,6 +172,8 @@ class Schedule:
     - `adapt_until`: last iteration after which the method may adapt.
     - `settled`: a run has also converged if the objective changed by less than this share of it
       over the last two intervals between checks.
+    - `still`: or if the image changed by less than this share of it over the last interval, and the
+      objective by less than half of that.
     """
 
     iterations: int
@@ -173,6 +182,7 @@ class Schedule:
     adapt_until: int = 0
     done: int = 0
     settled: float = 0.0
+    still: float = 0.0
 
 
 def iterate(
@@ -197,7 +207,7 @@ def iterate(
     def judged(image) -> float:
         return float(np.sum(np.asarray((objective or method.objective)(image))))
 
-    best, history = image, [Progress(done, judged(image), math.nan, math.nan)]
+    best, last, history = image, image, [Progress(done, judged(image), math.nan, math.nan)]
     status: Status = "iterations_exhausted"
     try:
         state = method.start(image)
@@ -216,7 +226,9 @@ def iterate(
             history.append(progress)
             small = max(progress.primal, progress.dual) < schedule.tolerance
             is_stopped = callback is not None and callback(progress)
-            if small or _settled(history, schedule.settled):
+            still = schedule.still > 0 and _is_still(history, last, current, schedule.still)
+            last = current
+            if small or still or _settled(history, schedule.settled):
                 status = "converged"
                 break
             if is_stopped:
@@ -234,6 +246,14 @@ def _settled(history: Sequence[Progress], share: float) -> bool:
     """Whether the objective hardly changed over the last two intervals between checks."""
     last = [p.objective for p in history[-3:]]
     return len(history) > 3 and max(last) - min(last) < share * last[-1]
+
+
+def _is_still(history: Sequence[Progress], before: Image, after: Image, share: float) -> bool:
+    """Whether image and objective hardly changed; on the host, where nothing is compiled."""
+    first, last = (p.objective for p in history[-2:])
+    old, new = (np.ravel(np.asarray(image)) for image in (before, after))
+    moved, size = (float(np.linalg.norm(one)) for one in (new - old, new))
+    return moved <= share * size and abs(last - first) <= share / 2 * abs(last)
 
 
 @eqx.filter_jit
@@ -259,6 +279,8 @@ def _steps(method: OptimistixMethod, state: SolverState, count: Any) -> SolverSt
         )
         return SolverState(value, inside)
 
+    if not method.judged:
+        return jax.lax.fori_loop(0, count, step, state)
     return step(0, jax.lax.fori_loop(1, count, step, state))
 
 

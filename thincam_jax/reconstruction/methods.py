@@ -18,15 +18,15 @@ from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix
 from thincam_jax.imaging.operators.low_rank import LowRank
+from thincam_jax.reconstruction.assembly import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
-from thincam_jax.reconstruction.coarse import coarser, finer
+from thincam_jax.reconstruction.coarse import coarsened, finer
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
 from thincam_jax.reconstruction.other_psf import better_psf
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
-from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
@@ -57,11 +57,9 @@ from thincam_jax.reconstruction.wiener import Wiener, filter_suffices
 # separated by the weak frequencies in which their PSFs differ: in half of all iterations, as fast
 # as otherwise in four times as many.
 _BALANCED = 30
-# From an image of coarse pixels: the third time follows what that image lacks in detail, and costs
-# up to 70 iterations at 40 dB and more.
-_NEARLY = 20
 # How often pixels are made twice as large, and the tolerance there: the image is only a start.
-_COARSER, _ROUGH = 2, 3e-3
+# From it an image ends that changes by less than this times the tolerance in ten iterations.
+_COARSER, _ROUGH, _STILL = 2, 3e-3, 200.0
 # Variation of an image whose smooth light counts less, in parts of the first one's, below which it
 # is taken: 0.35 to 0.85 where shading had spoilt detail. That of a real hand is 1.0, with haze.
 _CALMER = 0.92
@@ -285,8 +283,9 @@ class AdmmTV(AbstractRegularised):
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: sums of captures in place of the captures, see
       `thincam_jax.reconstruction.synthesis`; for `Cameras` only.
-    - `iterations`: at most. `tolerance`: relative residuals at which they end. So does a change
-      of the objective over 20 iterations by a tenth of a percent, of less as the square of less.
+    - `iterations`: at most. `tolerance`: relative residuals at which they end. So does, from an
+      image on larger pixels, a change of the image over ten iterations by 200 times as much, 2 %;
+      else one of the objective over 20 by a tenth of a percent, of less as the square of less.
 
     **Errors**: ValueError, one line, for values out of range.
 
@@ -320,7 +319,7 @@ class AdmmTV(AbstractRegularised):
         """
         if given:
             return self._by_admm(problem, image, callback)
-        outcome = self._by_levels(problem, image, callback, _COARSER)
+        outcome = self._by_levels(problem, image, callback)
         misfit = misfit_of(problem, outcome.image) if _is_settled(outcome) else None
         if misfit is None:
             return outcome
@@ -332,7 +331,7 @@ class AdmmTV(AbstractRegularised):
             return outcome
         easier, said = misfit.less_smooth(problem), str(misfit)
         if easier is not None:
-            again = self._by_levels(easier, image, callback, _COARSER)
+            again = self._by_levels(easier, image, callback)
             seconds = outcome.seconds + again.seconds
             before, after = (float(jnp.sum(problem.regulariser(o.image))) for o in (outcome, again))
             if after < _CALMER * before:
@@ -351,16 +350,19 @@ class AdmmTV(AbstractRegularised):
         """This solver with the tolerance of a start."""
         return dataclasses.replace(self, tolerance=max(self.tolerance, _ROUGH))
 
-    def _by_levels(self, problem, image, callback, levels: int) -> Outcome:
-        """Outcome by way of pixels up to `levels` times halved, which begin by `_from_nothing`."""
-        coarse = coarser(problem, image) if levels else None
-        if coarse is None:
+    def _by_levels(self, problem, image, callback) -> Outcome:
+        """Outcome by way of larger pixels, if there are enough."""
+        coarse, small, size = coarsened(problem, image, _COARSER)
+        if size == 1:
             return self._from_nothing(problem, image, callback)
-        first = self._rough._by_levels(*coarse, None, levels - 1)
+        first = self._rough._from_nothing(coarse, small, None)
         image = finer(first.image, problem.field_shape)
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)
-        second = self._by_admm(problem, image, callback, near=True)
+        # Penalties are those of the image, and stay.
+        schedule = Schedule(self.iterations, self.tolerance, still=_STILL * self.tolerance)
+        method = in_parallel(problem, admm_method, image)
+        second = iterate(method, image, schedule, callback=callback)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
 
     def _from_nothing(self, problem, image, callback) -> Outcome:
@@ -384,15 +386,15 @@ class AdmmTV(AbstractRegularised):
             seconds=first.seconds + second.seconds,
         )
 
-    def _by_admm(self, problem, image, callback, done: int = 0, *, near: bool = False) -> Outcome:
-        """Outcome from an image; `near`: one of coarse pixels."""
+    def _by_admm(self, problem, image, callback, done: int = 0) -> Outcome:
+        """Outcome from any image."""
         half, planes = (self.iterations - done) // 2, problem.image_shape[-3]
-        until = done + (min(_NEARLY if near else _BALANCED, half) if planes == 1 else half)
+        until = done + (min(_BALANCED, half) if planes == 1 else half)
         limits = self.iterations, self.tolerance
         # About its minimum the objective changes by the square of the image's change.
         settled = 10 * self.tolerance * min(1.0, self.tolerance / _FINE)
         schedule = Schedule(*limits, adapt_until=until, done=done, settled=settled)
-        method = in_parallel(problem, functools.partial(admm_method, near=near))
+        method = in_parallel(problem, admm_method)
         return iterate(method, image, schedule, callback=callback)
 
 

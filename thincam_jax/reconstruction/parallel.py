@@ -29,15 +29,18 @@ from thincam_jax.reconstruction.total_variation import TotalVariation
 class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
     """A method for each independent part of a problem; residuals are those of the worst.
 
-    - `method`: makes the method of a part.
+    - `method`: makes the method of a part, from the part of an image `near` as well.
     """
 
     methods: tuple[AbstractMethod, ...]
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, problem: InverseProblem, method: Callable[[InverseProblem], AbstractMethod]):
-        self.shape = problem.image_shape
-        self.methods = tuple(_in_threads(method, independent_parts(problem)))
+    def __init__(
+        self, problem: InverseProblem, method: Callable[..., AbstractMethod], near: Any = None
+    ):
+        self.shape, parts = problem.image_shape, independent_parts(problem)
+        images = [] if near is None else [_parts(near, (len(parts), -1, *self.shape[-3:]))]
+        self.methods = tuple(_in_threads(method, parts, *images))
 
     def start(self, image: Image):
         return tuple(_in_threads(lambda m, i: m.start(i), self.methods, self._split(image)))
@@ -72,10 +75,15 @@ class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
 
 
 def in_parallel(
-    problem: InverseProblem, method: Callable[[InverseProblem], AbstractMethod]
+    problem: InverseProblem, method: Callable[..., AbstractMethod], near: Image | None = None
 ) -> AbstractMethod:
-    """The method of a problem, or of its independent parts if `parallel_pays`."""
-    return ParallelMethod(problem, method) if parallel_pays(problem) else method(problem)
+    """The method of a problem, or of its independent parts if `parallel_pays`.
+
+    - `near`: an image that the method takes as well.
+    """
+    if parallel_pays(problem):
+        return ParallelMethod(problem, method, near)
+    return method(problem) if near is None else method(problem, near)
 
 
 def parallel_pays(problem: InverseProblem) -> bool:

@@ -27,6 +27,8 @@ from thincam_jax.reconstruction.noise import (
     given_variances,
     is_below_black,
     unseen_variance,
+    valid_pixels,
+    without_unknown,
 )
 from thincam_jax.reconstruction.problem import Background, InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
@@ -38,7 +40,6 @@ from thincam_jax.reconstruction.synthesis import (
     synthesis_matrix,
     with_channel,
 )
-from thincam_jax.reconstruction.unknown_pixels import valid_pixels, without_unknown
 
 
 class Recording(Module):

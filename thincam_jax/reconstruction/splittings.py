@@ -21,7 +21,7 @@ equation, (μ₁ + μ₂ΨᵀΨ + μ₃)⁻¹. The proximal map of the data is t
 which `normal_equations` finds by the structure of the operators.
 """
 
-import functools
+import math
 from dataclasses import replace
 from typing import ClassVar
 
@@ -68,20 +68,26 @@ from thincam_jax.reconstruction.total_variation import (
     within_field,
 )
 
+# Penalties from an image near the one sought: step of a difference over the image's standard
+# deviation, μ₃/√μ₂, and the least μ₂ over that of a far image.
+_STEP, _FRAME, _LEAST = 0.6, 0.85, 1e-4
 _SETS = 10  # of backgrounds that are positive, at most
 
 
 def admm_method(
-    problem: InverseProblem, relaxation: Number = RELAXATION, *, near: bool = False
+    problem: InverseProblem, near: Image | None = None, *, relaxation: Number = RELAXATION
 ) -> AdmmMethod:
-    """ADMM for a problem, with the splitting that suits its operators; see `splitting_of`."""
-    return AdmmMethod(problem, splitting_of(problem, near=near), relaxation)
+    """ADMM for a problem, with the splitting that suits its operators; see `splitting_of`.
+
+    From a `near` image penalties stay, and steps are not judged.
+    """
+    return AdmmMethod(problem, splitting_of(problem, near), relaxation, judged=near is None)
 
 
-def splitting_of(problem: InverseProblem, *, near: bool = False) -> AbstractSplitting:
+def splitting_of(problem: InverseProblem, near: Image | None = None) -> AbstractSplitting:
     """The splitting that suits the operators of a problem.
 
-    - `near`: whether the start image has the right low frequencies.
+    - `near`: a start image with the right low frequencies, to which penalties are suited.
     """
     variation = problem.regulariser
     if not isinstance(variation, TotalVariation):
@@ -92,7 +98,7 @@ def splitting_of(problem: InverseProblem, *, near: bool = False) -> AbstractSpli
     operators = convolutions(problem)
     if operators is None:
         return DirectSplitting(problem, variation)
-    return FourierSplitting(problem, operators, variation, near=near)
+    return FourierSplitting(problem, operators, variation, near)
 
 
 class FourierSplitting(AbstractSplitting):
@@ -113,8 +119,7 @@ class FourierSplitting(AbstractSplitting):
         problem: InverseProblem,
         operators: tuple[CropConvolution, ...],
         variation: TotalVariation,
-        *,
-        near: bool = False,
+        near: Image | None = None,
     ):
         units = _units(problem, operators, variation)
         # The operators themselves: a compiled function would return copies.
@@ -122,7 +127,10 @@ class FourierSplitting(AbstractSplitting):
         self.gains, self.captures, self.weights, self.tau, self.normal, self.image_unit = units
         self.variation, self.nonnegative = variation, problem.nonnegative
         self.background = problem.background
-        self.penalties = _default_penalties(self.operators, self.gains, near)
+        self.penalties = _default_penalties(self.operators, self.gains)
+        if near is not None:
+            unit = self.image_unit
+            self.penalties = _near_penalties(self.penalties, near, unit, self.tau)
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
         scaled = tuple(g / self.image_unit * c for g, c in zip(self.gains, captures, strict=True))
@@ -204,15 +212,14 @@ def _units(problem: InverseProblem, operators, variation: TotalVariation):
     return gains, captures, weights, tau, normal, capture_unit / operator_unit
 
 
-@functools.partial(jax.jit, static_argnames="near")
-def _default_penalties(operators, gains, near: bool) -> Penalties:
+@jax.jit
+def _default_penalties(operators, gains) -> Penalties:
     r"""Penalties that suit the operators' spectrum, by rules of thumb.
 
     If one low frequency is far stronger than the others, as with a bright background, the splits
     of variation and image weigh more by the ratio r = max|H|/rms|H|, μ₂ = μ₃ = r. μ₁ = 1 weighs the
-    split data like the data. From an image with the right low frequencies 3√r and √r are faster.
-    Residual balancing corrects them. Several planes are separated by frequencies in which their
-    PSFs differ, a tenth as strong or less: μ₁ = 0.1, μ₂ = μ₃ = r/100.
+    split data like the data. Residual balancing corrects them. Several planes are separated by
+    frequencies in which their PSFs differ, a tenth as strong or less: μ₁ = 0.1, μ₂ = μ₃ = r/100.
     """
     power = sum(
         g**2 * jnp.sum(squared_modulus(o.spectrum), axis=-3)
@@ -221,9 +228,21 @@ def _default_penalties(operators, gains, near: bool) -> Penalties:
     strongest = jax.lax.stop_gradient(or_one(jnp.sqrt(jnp.max(power))))
     if operators[0].spectrum.shape[-3] > 1:
         return Penalties(jnp.full_like(strongest, 0.1), strongest / 100, strongest / 100)
-    root = jnp.sqrt(strongest)
-    variation, image = (3 * root, root) if near else (strongest, strongest)
-    return Penalties(jnp.ones_like(strongest), variation, image)
+    return Penalties(jnp.ones_like(strongest), strongest, strongest)
+
+
+def _near_penalties(far: Penalties, image: Image, unit, tau) -> Penalties:
+    r"""Penalties from an image with the right low frequencies: those of Fourier's splitting.
+
+    A step shortens differences by τ/μ₂. It is set to 0.6 standard deviations of the image, which
+    neither removes what the image has nor leaves its noise, and μ₃ = 0.85 √μ₂
+    (docs/decisions/penalties_of_levels.md).
+    """
+    most, spread = float(far.variation), float(np.std(np.asarray(image))) / float(unit)
+    wanted = float(tau) / (_STEP * spread) if spread > 0 else most
+    variation = min(max(wanted, _LEAST * most), most)
+    pair = (jnp.asarray(p, tau.dtype) for p in (variation, _FRAME * math.sqrt(variation)))
+    return Penalties(far.data, *pair)
 
 
 def _operator_unit(operators, weights) -> Float[Array, ""]:

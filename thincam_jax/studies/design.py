@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from thincam_jax._core.precision import allow, cast, decimal_value, precision_of
-from thincam_jax._core.progress import Progress, Step, carry_out
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.design import SearchSettings, find_designs
 from thincam_jax.design.design import Design
 from thincam_jax.design.fronts import FrontPoint, FrontSearch, front_point, search_order

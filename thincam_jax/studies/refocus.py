@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.progress import Progress, Step, carry_out
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
@@ -26,15 +26,16 @@ from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import resize
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.reconstruction.depth.find import (
+    MEASURES,
     DepthMap,
     FocusCurves,
     FocusPeak,
+    Measure,
     all_in_focus,
     depth_map,
     find_distances,
     object_regions,
 )
-from thincam_jax.reconstruction.depth.focus import MEASURES, Measure
 from thincam_jax.reconstruction.depth.refocus import (
     RefocusSweep,
     axial_resolution,
@@ -444,7 +445,11 @@ class RefocusRun:
     def result(self) -> RefocusResult:
         """All of it, at the end."""
         refocusing, asked = self.refocusing, self.refocusing.sweep
-        sweep = _joined(refocusing, self.swept)
+        images, distances = jnp.stack([one.image for one in self.swept]), asked.distances
+        # p·t/d of any image over its t.
+        slope = jnp.reshape(jnp.asarray(self.swept[-1].pitch, images.dtype), ()) / distances[-1]
+        solver = refocusing.sweep_method.solver.name
+        sweep = RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, solver)
         found = find_objects(refocusing, sweep)
         depth = depth_map(
             sweep, measure=asked.measure, smoothing=asked.smoothing, window=asked.window
@@ -459,15 +464,6 @@ class RefocusRun:
             self.methods,
             self.images,
         )
-
-
-def _joined(refocusing: RefocusStudy, focused: list[Reconstruction]) -> RefocusSweep:
-    """Reconstructions that are focused on each of the distances, as one sweep."""
-    images, distances = jnp.stack([one.image for one in focused]), refocusing.sweep.distances
-    # p·t/d of any image over its t.
-    slope = jnp.reshape(jnp.asarray(focused[-1].pitch, images.dtype), ()) / distances[-1]
-    method = refocusing.sweep_method.solver.name
-    return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, method)
 
 
 def psnr_of_objects(

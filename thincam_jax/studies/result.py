@@ -210,7 +210,7 @@ def _mean_psnr(scores: Iterable[Scores]) -> float | None:
     return round(float(np.mean(known)), 4) if known else None
 
 
-def metrics_row(study: Study) -> dict[str, Any]:
+def metrics_row(study: Study) -> dict[str, float | int | str | None]:
     """The study's scores as one row of a table, and the seconds that they took.
 
     Columns are `psnr_db/METHOD/TARGET`, `resolved_object_mm/METHOD/TARGET` of an inner number, and

@@ -12,7 +12,7 @@ from lensless.plan.scenes import camera, scene
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2
-from thincam_jax.lensless.propagation.path import psf_change
+from thincam_jax.lensless.camera import psf_change
 from thincam_jax.units import nm
 
 

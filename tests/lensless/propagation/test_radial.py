@@ -10,8 +10,8 @@ from scipy.special import j0
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2, value_and_slope
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.method import LATTICE_POINTS
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import (
     PROFILE_ERROR,
     irradiance,

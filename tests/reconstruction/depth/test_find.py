@@ -12,14 +12,16 @@ import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick
 from thincam_jax.reconstruction import fringe_scanning
 from thincam_jax.reconstruction.depth.find import (
+    MEASURES,
     all_in_focus,
     depth_map,
     depth_of_colours,
     find_distances,
+    focus_measure,
+    gaussian_average,
     object_regions,
     vertex,
 )
-from thincam_jax.reconstruction.depth.focus import MEASURES, focus_measure, gaussian_average
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep, refocus_distances, refocus_sweep
 
 

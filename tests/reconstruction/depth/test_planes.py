@@ -12,8 +12,8 @@ from reconstruction.depth import rig
 import thincam_jax as tc
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction import fringe_scanning
+from thincam_jax.reconstruction.assembly import without_smooth_misfit
 from thincam_jax.reconstruction.depth import find_distances, refocus_sweep
-from thincam_jax.reconstruction.planes import without_smooth_misfit
 from thincam_jax.reconstruction.problem import misfit
 
 PLANES = (20.0, 45.0, 150.0)

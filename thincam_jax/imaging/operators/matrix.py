@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.experimental import sparse
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core.checks import Numbers, Shape
@@ -101,7 +100,7 @@ class Sparse(AbstractPixelMap):
         require_shape("capture", capture, self.out_shape)
         return _sums(self.values, self.rows, self.columns, capture, self.out_shape, self.in_shape)
 
-    def by_rows(self) -> scipy.sparse.csr_array:
+    def by_rows(self) -> "scipy.sparse.csr_array":
         """H for SciPy, row by row."""
         shape = math.prod(self.out_shape), math.prod(self.in_shape)
         values, rows, columns = (np.asarray(x) for x in (self.values, self.rows, self.columns))
@@ -133,6 +132,8 @@ def _sums(values, sources, targets, image, shape, result_shape):
 
 def _entries(matrix):
     """Values, rows and columns of a sparse matrix."""
+    from jax.experimental import sparse  # here, since it takes a tenth of a second
+
     if isinstance(matrix, sparse.BCOO):
         if matrix.n_batch or matrix.n_dense or matrix.ndim != 2:
             raise ValueError(

@@ -20,6 +20,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import fast_shape
 from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
+from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import tolerance_of
@@ -28,10 +29,11 @@ from thincam_jax.lensless.field import light_over_field, points_needed, tangents
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
+    has_few_terms,
     term_count,
     zone_orders,
 )
-from thincam_jax.lensless.method import PsfMethod, has_few_terms
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.choose import choose_planes, choose_psf, choose_wavelengths
 from thincam_jax.lensless.plan.run import CapturePlan, effects_of
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
@@ -160,6 +162,7 @@ _MODEL_SHARE, _FIELD_SHARE, _WAVELENGTH_SHARE = 0.3, 0.3, 0.6
 
 
 @checked
+@watched("planning the capture")
 def plan_capture(
     camera: LenslessCamera, scene: Scene, *, tolerance: float, over_field: bool = True
 ) -> CapturePlan:

@@ -13,12 +13,12 @@ from thincam_jax._core.memory import readable, refuse_if_too_large
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import probe_of
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, psf_change
 from thincam_jax.lensless.field import light_over_field
 from thincam_jax.lensless.forward import operator_of, project, projected_shape
+from thincam_jax.lensless.masks.base import has_few_terms
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import SAMPLED, PsfMethod, has_few_terms
-from thincam_jax.lensless.propagation.path import psf_change
+from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.resolve import Cost
 
 

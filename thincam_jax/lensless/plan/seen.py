@@ -12,14 +12,8 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import points_needed, tangents_of
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.method import (
-    CLOSED,
-    Model,
-    PsfMethod,
-    has_few_terms,
-    models_of,
-    psf_method,
-)
+from thincam_jax.lensless.masks.base import has_few_terms
+from thincam_jax.lensless.method import CLOSED, Model, PsfMethod, models_of, psf_method
 from thincam_jax.lensless.plan.transfer import (
     SampledProbe,
     TransferProbe,

@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool, Complex, Float
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_average
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable import SeparableSum
 
 

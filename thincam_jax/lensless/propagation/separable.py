@@ -13,6 +13,7 @@ from numpy.polynomial.legendre import leggauss
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import Precision, as_complex, product, turn_phasor
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -23,7 +24,6 @@ from thincam_jax.lensless.masks.base import (
 )
 from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
-from thincam_jax.lensless.propagation.path import LightPath
 
 
 class SeparableSum(eqx.Module):

@@ -23,8 +23,8 @@ import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax import waveguide as wg
-from thincam_jax._core.progress import Progress, Step, carry_out
 from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatrix, Sparse

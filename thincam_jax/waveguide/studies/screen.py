@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array
 
 from thincam_jax import waveguide as wg
-from thincam_jax._core.progress import Progress, Step, carry_out
 from thincam_jax._core.quantity import check_fields, choice, quantity
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.imaging.operators.base import dtype_of
