@@ -7,6 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2
+from thincam_jax.lensless.masks import maximum_length_sequence
 from thincam_jax.units import nm, um
 
 IMAGE = np.random.default_rng(0).uniform(size=(11, 14))
@@ -76,3 +77,23 @@ def test_what_has_no_terms_is_refused():
         tc.separable_operator(camera(), two)
     with pytest.raises(TypeError, match="scene is an array .*; give Scene"):
         tc.separable_operator(camera(), IMAGE)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("distance", "missed"), [(0.5, (11.5, 3.9, 0.5)), (2.0, (28.5, 19.8, 2.4))]
+)
+def test_how_many_products_a_coded_mask_needs(distance, missed):
+    """The table of docs/measured/flatcam.md, per cent, by singular values of the centred PSF."""
+    code = maximum_length_sequence(255)
+    mask = tc.SeparableMask(code, code, cell=30 * um, combine="xor")
+    flat = tc.LenslessCamera(mask, tc.Sensor((1020, 1020), 7.5 * um), distance)
+    seen = sum(
+        np.asarray(tc.psf(flat, wavelength=float(w), pixel_integration=True))
+        for w in np.linspace(400, 700, 7) * nm
+    )
+    centred = seen - seen.mean(axis=0)
+    centred = centred - centred.mean(axis=1, keepdims=True)
+    squares = np.linalg.svd(centred, compute_uv=False) ** 2
+    found = [100 * (squares[n:].sum() / squares.sum()) ** 0.5 for n in (1, 2, 3)]
+    np.testing.assert_allclose(found, missed, rtol=0.03, atol=0.06)
