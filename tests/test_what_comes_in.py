@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 import thincam_jax as tc
 from thincam_jax.commands import cli
 from thincam_jax.imaging.encoding import ORIENTATION
-from thincam_jax.imaging.operators import Separable
 from thincam_jax.units import nm, um
 
 SHAPE, DARK, FULL = (96, 128), 64, 4095
@@ -113,24 +112,6 @@ def test_a_raw_file_says_pattern_and_levels(tmp_path, image_of):
             image_of(*files, *wrong)
 
 
-@pytest.mark.thorough
-def test_arrays_that_carry_meaning(image_of):
-    """Masks, NaN and other bytes of Python's arrays; NaN in a float file."""
-    light = cells(SHAPE, size=3)
-    given = {name: (one - DARK) / FULL for name, one in pair(light).items()}
-    dead = np.random.default_rng(0).random(SHAPE) < 0.02
-    spoilt = np.where(dead, 50.0, given["capture"])
-    psfs, solver = tc.Psfs(given["psf"][None]), tc.AdmmTV(iterations=60)
-    best = quality(tc.reconstruct(tc.Recording([spoilt], psfs, valid=~dead), solver).image, TRUE)
-    for capture in (np.ma.masked_array(spoilt, dead), np.where(dead, np.nan, spoilt)):
-        capture = capture.astype(">f8")  # as FITS has it
-        image = tc.reconstruct(tc.Recording([capture], psfs), solver).image
-        assert quality(image, TRUE) > best - WITHIN
-    given["capture"] = np.where(dead, np.nan, spoilt)
-    given = {name: one.astype(np.float32) for name, one in given.items()}
-    assert quality(image_of(**given)[0], TRUE) > best - WITHIN
-
-
 def test_numbers_in_place_of_leaves():
     """`eqx.tree_at` puts a Python number where a camera holds an array."""
     mask = tc.FresnelZoneAperture(beta=20.0, width=3.0)
@@ -194,21 +175,3 @@ def test_formats_of_a_laboratory(tmp_path, name):
         exec(line, names)
         path = path.with_suffix(".npy")
     np.testing.assert_array_equal(tc.measured.read_image(path).pixels, array)
-
-
-@pytest.mark.thorough
-def test_a_code_as_fine_as_a_pixel():
-    """`Ridge("sure")` finds the noise, not the code."""
-    generator = np.random.default_rng(4)
-    left, right = (
-        np.where(generator.random((n, m)) < 0.5, 1.0, 0.0)
-        for n, m in zip((112, 150), SHAPE, strict=True)
-    )
-    clean = left @ TRUE @ right.T
-    noise = clean.std() / 100
-    capture = clean + noise * generator.normal(size=clean.shape)
-    given = {"noise_variance": noise**2, "background": 0.0}
-    recording = tc.Recording([capture], Separable(left, right), **given)
-    best = quality(tc.reconstruct(recording, tc.Ridge("sure")).image, TRUE)
-    recording = tc.Recording([capture], Separable(left, right))
-    assert quality(tc.reconstruct(recording, tc.Ridge("sure")).image, TRUE) > best - WITHIN

@@ -24,22 +24,6 @@ LENGTH = Variable("distance", 2.0, 9.0, (0, 1, 2, 3))
 WIDE = Variable("width", 3.0, 8.0)
 
 
-def test_a_design_on_its_limit_may_be_the_base_of_another_space():
-    """In single precision 6.3 mm is a rounding above itself."""
-    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), BASE)
-    on_limit = shots(
-        jnp.asarray([25.0, 21.0], jnp.float32),
-        jnp.asarray(6.3, jnp.float32),
-        (0.0, 1.5),
-        wavelength=5e-4,
-        width=5.6,
-    )
-    assert float(jnp.asarray(6.3, jnp.float32)) > 6.3
-    assert DesignSpace(on_limit, (BETA,), Limits(thickness=6.3)).size == 1
-    with pytest.raises(ValueError, match="conflicts with a thickness"):
-        DesignSpace(single, (BETA,), Limits(thickness=6.3))
-
-
 def test_mask_pixels_hold_for_every_width():
     """β·width ≤ π/pixel at 500 random points of three variables and at the corners."""
     pixel = 0.02

@@ -116,22 +116,3 @@ def test_too_wide_a_field_says_what_to_do():
     message = "21 points an axis .* give a larger tolerance or a smaller field"
     with pytest.raises(ValueError, match=message):
         tc.field_operator(camera, 500 * nm, field_shape=(400, 400), tolerance=1e-4)
-
-
-@pytest.mark.thorough
-def test_cells_off_both_axes():
-    """By default sampled: as a point of the corner has it with more samples."""
-    mask = tc.ModifiedUniformlyRedundantArray(5, cell=0.12)
-    camera = tc.LenslessCamera(mask, tc.Sensor((12, 16), 50 * um), DISTANCE)
-    shape = 48, 64
-    fit = tc.field_operator(camera, 500 * nm, field_shape=shape, tolerance=0.02)
-    wide = camera.on_grid(kernel_grid(camera.sensor.grid, shape))
-    seen = [(k - (n - 1) / 2) * 50 * um / DISTANCE for k, n in zip((1, 60), shape, strict=True)]
-    finer = tc.PsfMethod("angular_spectrum", oversampling=31, pixel_integration=True)
-    h = psf_about_ray(wide, 500 * nm, float("inf"), (-seen[0], -seen[1]), finer)
-    h = np.asarray(h) * (1 + seen[0] ** 2 + seen[1] ** 2) ** -2
-    point = jnp.zeros(shape).at[1, 60].set(1 / (50 * um) ** 2)
-    exact = h[shape[0] - 2 :, shape[1] - 61 :][:12, :16]
-    assert fit.truncation_error + fit.interpolation_error < 0.02
-    error = np.linalg.norm(np.asarray(fit.operator(point)) - exact)
-    assert error < 0.02 * np.linalg.norm(h)

@@ -89,58 +89,6 @@ def test_closed_form_otf():
     np.testing.assert_allclose(H, expected, rtol=0, atol=1e-12)
 
 
-def scanned(distance, frequency):
-    """(OTF(3π/2) − OTF(π/2)) + j(OTF(0) − OTF(π)) along u, by `tc.otf` on 1×N sensors."""
-    pitch = 1 / (len(frequency) * (frequency[1] - frequency[0]))
-    responses = {
-        turns: point_otf(
-            camera_of(
-                (1, len(frequency)), pitch, beta=25.0, phase=turns * np.pi / 2, distance=distance
-            ),
-            wavelength=WAVELENGTH,
-            model="paraxial",
-        )[0]
-        for turns in range(4)
-    }
-    return np.asarray(responses[3] - responses[1] + 1j * (responses[0] - responses[2]))
-
-
-@pytest.mark.parametrize(("distance", "zero"), [(6.5, 12.40), (5.0, 14.14)])
-def test_first_zero_of_the_fringe_scanned_response(distance, zero):
-    """Eq 3.31, corrected: cos(πλdρ²) = 0 at ρ = 1/√(2λd); 12.40 and 14.14 cycles/mm.
-
-    The package keeps both orders' own chirps kβ(1 − kε), so that the response there is a minimum of
-    modulus, not an exact zero; its product with the conjugate geometric response changes sign.
-    """
-    frequency = np.arange(-3000, 3000) * 0.01
-    response = scanned(distance, frequency)
-    compensated = (response * np.exp(-1j * np.pi**2 * frequency**2 / 25.0)).real
-    positive = frequency > 1.0
-    crossing = np.flatnonzero(np.diff(np.sign(compensated[positive])))[0]
-    found = frequency[positive][crossing] + 0.005
-    assert abs(found - zero) < 0.05
-    assert abs(1 / np.sqrt(2 * WAVELENGTH * distance) - zero) < 0.005
-
-
-@pytest.mark.parametrize("distance", [6.5, 5.0])
-def test_eq_3_31_and_3_49_corrected(distance):
-    """From `paraxial_response`: (π/β)e^{jX}cos(πλdρ²), and the pair's difference with its X/2."""
-    from thincam_jax.lensless.propagation.closed_form import paraxial_response
-
-    beta, rho2 = 25.0, np.linspace(0.0, 900.0, 301)
-    x, turn = np.pi**2 * rho2 / beta, np.cos(np.pi * WAVELENGTH * distance * rho2)
-    at = {
-        k: np.asarray(
-            paraxial_response(jnp.asarray(rho2), beta, k * np.pi / 2, WAVELENGTH, distance)
-        )
-        for k in range(4)
-    }
-    scan = at[3] - at[1] + 1j * (at[0] - at[2])
-    np.testing.assert_allclose(scan, np.pi / beta * np.exp(1j * x) * turn, rtol=0, atol=1e-13)
-    pair = np.pi / (2 * beta) * turn * (np.sin(x) - np.cos(x)) + np.pi / (8 * beta) * np.sin(x / 2)
-    np.testing.assert_allclose(at[0] - at[3], pair, rtol=0, atol=1e-13)
-
-
 # --- gradients ------------------------------------------------------------------------------------
 
 NAMES = ("beta", "phase", "distance", "wavelength", "object_distance", "width")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from reconstruction import dense, scenes
 
-import thincam_jax as tc
 from helpers import count_traces, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
@@ -328,18 +327,3 @@ def test_balanced_penalties_keep_the_image():
     # nothing is rebuilt for a balance that is good enough
     even = replace(residuals, parts=((1.1, 1.0), (1.0, 1.1), (0.0, 1.0)))
     assert method.adapt(state, even)[0] is method
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("bin_by, most", [(8, 100), (4, 130)])
-def test_what_500_plain_iterations_reach_in_a_quarter_of_them(optimised, bin_by, most):
-    """A measured capture, with the relaxation and the balance of `AdmmTV`: 80 and 110."""
-    raw, psf = scenes.hand(bin_by)
-    recording = tc.Recording(raw[None], tc.Psfs(psf[None]))
-    plain = driven(
-        recording.problem(), iterations=500, tolerance=0.0, relaxation=1.0, adapt_until=0
-    )
-    goal = plain.history[-1].objective * (1 + 1e-6)
-    result = tc.reconstruct(recording, tc.AdmmTV(iterations=150, tolerance=0.0))
-    reached = (p.iteration for p in result.history if p.objective <= goal)
-    assert next(reached, np.inf) <= most

@@ -216,25 +216,3 @@ def test_implicit_gradients_of_a_dense_operator():
         slope = sum(np.vdot(s, d) for s, d in zip(slopes, direction, strict=True))
         change = finite_difference(lambda x: both(x)[0], at, direction, 1e-4)
         assert float(slope) == pytest.approx(float(change), rel=1e-4)
-
-
-@pytest.mark.thorough
-def test_batches_and_planes():
-    """A batch is its elements; an operator on (plane, y, x) has its planes in the image."""
-    rng = np.random.default_rng(3)
-    operator = Separable(rng.normal(size=(13, 9)), rng.normal(size=(17, 12)))
-    images = jnp.asarray(np.stack([scenes.blocks(FIELD, seed=n) for n in range(6)]))
-    captures = operator(images.reshape(2, 3, *FIELD))
-    solver = tc.AdmmTV(iterations=400, tolerance=1e-6)
-    both = tc.reconstruct(tc.Recording(captures, operator, noise_variance=1e-6), solver)
-    assert both.image.shape == (2, 3, *FIELD)
-    alone = tc.reconstruct(tc.Recording(captures[1, 2], operator, noise_variance=1e-6), solver)
-    assert relative_l2(both.image[1, 2], alone.image) < 1e-3
-    assert relative_l2(both.image[1, 2], images[5]) < 1e-2
-
-    shape = (2, 5, 4)
-    matrix = Matrix(rng.normal(size=(60, 40)), shape, (60,))
-    truth = jnp.asarray(np.stack([scenes.blocks(shape[1:], seed=n) for n in range(2)]))
-    recording = tc.Recording(matrix(truth), matrix, noise_variance=1e-6)
-    found = tc.reconstruct(recording, tc.AdmmTV(iterations=300))
-    assert found.image.shape == shape and relative_l2(found.image, truth) < 1e-2

@@ -11,7 +11,6 @@ import lineax as lx
 import numpy as np
 import pytest
 from reconstruction import scenes
-from reconstruction.test_admm import case, solved
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, relative_l2
@@ -138,28 +137,6 @@ def test_the_gradient_of_a_psnr_by_differences(name):
     expected = float(finite_difference(value, at, direction, 1e-4))
     assert abs(expected) > 1e-2 and 24 < float(value(at)) < 26
     assert slope == pytest.approx(expected, rel=1e-3)
-
-
-def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
-    result = solve_fixed_point(
-        splitting_of(problem).with_penalties(tuned(problem, factor)),
-        jnp.zeros(problem.image_shape),
-        iterations=iterations,
-        tolerance=tolerance,
-        relaxation=1.8,
-    )
-    return result.image, result.iterations, result.converged
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["planes", "colour", "two"])
-def test_it_is_the_minimiser_of_the_iteration_in_chunks(name):
-    given = case(name)
-    image, iterations, converged = settled(given.problem)
-    assert bool(converged) and 50 < int(iterations) < 3000
-    assert relative_l2(image, solved(given.problem, iterations=3000)) < 1e-6
-    cut_short = settled(given.problem, iterations=7)
-    assert int(cut_short[1]) == 7 and not bool(cut_short[2])
 
 
 @pytest.mark.thorough

@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reconstruction import rig, scenes
+from reconstruction import scenes
 
-import thincam_jax as tc
 from helpers import quick, relative_l2
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import (
@@ -87,23 +86,6 @@ def test_the_worst_part_counts():
     assert found.primal == max(r.primal for r in found.elements)
     assert found.dual == max(r.dual for r in found.elements)
     assert len({r.primal for r in found.elements}) == 2
-
-
-@pytest.mark.thorough
-def test_units_and_penalties_do_not_depend_on_the_batch():
-    """Through the entry point: the same captures alone and beside a bright one."""
-    cameras = rig.pair()
-    captures = rig.captures(cameras, rig.picture())
-    model = tc.Cameras(cameras, object_distance=rig.OBJECT_DISTANCE, wavelength=rig.WAVELENGTH)
-    solver = tc.AdmmTV(iterations=30, tolerance=0.0)
-    alone, both = (
-        tc.reconstruct(tc.Recording(given, model, noise_variance=1e-12), solver)
-        for given in (
-            captures[:, None],
-            jnp.stack([captures, 1e3 * captures[..., ::-1]], axis=1)[:, :, None],
-        )
-    )
-    np.testing.assert_allclose(both.image[0], alone.image, rtol=1e-10, atol=1e-12)
 
 
 def test_only_independent_parts_run_in_parallel():

@@ -96,17 +96,6 @@ def test_shifts_between_psfs_are_mended():
 
 
 @pytest.mark.thorough
-def test_one_capture_tells_no_shift():
-    recording = tc.Recording(np.ones((1, 32, 40)), tc.Psfs(np.eye(9)[None]), noise_variance=1.0)
-    found = tc.refine(recording, parameters=["shift"], search=0.2)
-    assert found.undetermined == {
-        "shift": "one capture cannot determine it: the scene shifts instead"
-    }
-    assert not found.is_changed and not found.values
-    assert found.recording is recording and found.noise_ratio == found.noise_ratio_before
-
-
-@pytest.mark.thorough
 def test_a_camera_from_afar_tells_no_object_distance():
     one = tc.LenslessCamera(
         tc.FresnelZoneAperture(30.0, width=1.0), tc.Sensor((32, 40), 40 * um), 3.0

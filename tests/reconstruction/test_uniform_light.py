@@ -266,28 +266,3 @@ def test_it_can_end_in_the_first_part(wide_capture, ending):
     assert [p.iteration for p in result.history] == [0, 10, 20]
     np.testing.assert_array_equal(result.image, images[-1][:, 0, ::-1, ::-1])
     assert float(objective(problems[-1], images[-1])) == pytest.approx(result.history[-1].objective)
-
-
-@pytest.mark.thorough
-def test_what_has_no_first_part(wide_capture, monkeypatch):
-    """Few iterations, a start that is given, and other methods; none is longer than asked."""
-    asked = []
-    monkeypatch.setattr(uniform_light, "without_uniform_light", asked.append)
-    for iterations in (1, 10):
-        assert solve(wide_capture, iterations=iterations).iterations == iterations
-    solve(wide_capture, iterations=20, start=jnp.ones(WIDE))
-    assert not asked
-    solve(wide_capture, iterations=20)
-    assert len(asked) == 1
-
-
-@pytest.mark.thorough
-def test_a_batch_is_iterated_in_parallel(wide_capture):
-    """Each of its images as if it stood elsewhere."""
-    camera, image, variance, valid = wide_capture
-    images = jnp.stack([image, 3 * image[..., ::-1, :]], axis=1)
-    masks = np.stack([valid, np.ones_like(valid)], axis=1)
-    result = solve((camera, images, variance, masks), iterations=20)
-    assert [p.iteration for p in result.history] == [0, 10, 20]
-    turned = solve((camera, images[:, ::-1], variance, masks[:, ::-1]), iterations=20)
-    np.testing.assert_allclose(turned.image[::-1], result.image, rtol=1e-9, atol=1e-12)

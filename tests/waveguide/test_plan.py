@@ -161,15 +161,6 @@ def test_what_a_scene_requires(scene):
         assert words in str(strict)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("tolerance", [0.03, 1e-3])
-def test_the_light_of_several_planes_adds_up(scene, tolerance):
-    near = LitPlane(wg.ObjectPlane(CELLS, 250.0, 80.0, (27.0, 5.0)), pictures()[3])
-    plan = wg.plan_screen(thin(5.0), [scene, near], tolerance=tolerance)
-    predicted, true = errors(plan, scene, near)
-    assert true <= predicted <= min(tolerance, 5 * true)
-
-
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [

@@ -250,7 +250,7 @@ class _Run:
     """The iteration of one image: `result` is the last finite one, `mistake` that of the noise."""
 
     def __init__(self, solver: PlugAndPlay, problem: InverseProblem, like: AbstractNormal | None):
-        scaled = ScaledProblem(problem, iterations=_UNIT)
+        scaled = ScaledProblem(problem, iterations=_UNIT, whole=True)
         self.solver, self.unit = solver, scaled.image_unit
         # 1/variance of a capture in these units, and the weights, as they were given.
         self.given_precision = scaled.curvature * scaled.image_unit**2

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 import sys
 import time
 from typing import ClassVar

@@ -331,6 +331,17 @@ def test_hand(tmp_path):
     assert np.median(pixels) < 10 and pixels[70, 102] > 180  # black around, bright the palm
 
 
+@pytest.mark.thorough
+def test_hand_is_explained_as_well_as_before(tmp_path):
+    """At four times the pixels, as docs/guide/real_captures.md has it."""
+    folder = shared_data("diffusercam-hand")
+    paths = {"psf": folder / "psf_sample.tif", "capture": folder / "rawdata_hand_sample.tif"}
+    out = tmp_path / "hand.npy"
+    assert call(paths, out, "--downsample", 4).exit_code == 0
+    done = record_of(out)["reconstruction"]
+    assert done["relative_data_residual"] == pytest.approx(0.0055, rel=0.1)
+
+
 def check(paths, *more, psf="psf"):
     given = ["--psf", paths[psf], "--capture", paths["capture"], "--background", paths["dark"]]
     return runner.invoke(cli.app, ["calibrate", "check", *map(str, given), *map(str, more)])

@@ -5,9 +5,8 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax.hardware.acquisition.plan import BLACK, Pattern
-from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
-from thincam_jax.hardware.plans import pictures, zone_plate
+from thincam_jax.hardware.plans import zone_plate
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 PITCH = 0.036  # mm, the modulator of the thesis
@@ -86,19 +85,6 @@ def test_levels_of_the_patterns_of_a_plan():
     assert not pattern_levels(BLACK, SHAPE, PITCH).any()
     with pytest.raises(ValueError, match="kind 'own' has no levels"):
         pattern_levels(Pattern("own"), SHAPE, PITCH)
-
-
-def test_a_picture_is_the_one_of_the_plan():
-    picture = np.random.default_rng(0).integers(0, 256, (4, 8), np.uint8)
-    plan = pictures({"own": picture}, CameraSettings(exposure=0.01), frames=2, dark_frames=1)
-    assert [plan.pattern(step).kind for step in plan.steps] == ["black", "picture", "picture"]
-    shown = plan.pattern(plan.steps[1])
-    levels = pattern_levels(shown, SHAPE, PITCH, {"own": picture})
-    np.testing.assert_array_equal(levels[2:22], np.kron(picture, np.ones((5, 5))))
-    assert not levels[:2].any() and not levels[22:].any()
-    for other in ({}, {"own": picture ^ 1}, {"own": picture.reshape(8, 4)}):
-        with pytest.raises(ValueError, match="the picture 'own' is not the one of the plan"):
-            pattern_levels(shown, SHAPE, PITCH, other)
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (41, 61)])

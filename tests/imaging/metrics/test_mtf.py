@@ -230,22 +230,6 @@ def test_near_object_lowers_the_cut_off_by_the_magnification():
     assert near(METHOD_B).limits.cut_off_cycles_per_mm == pytest.approx(limit, abs=1.0)
 
 
-@pytest.mark.thorough
-def test_edge_tail_of_method_a_for_a_distant_object():
-    """Beyond βR/π the sharp edge of the aperture leaves a tail, and 5 % is inside it.
-
-    The end of a chirp falls to half at u_c = βR/π and then as 1/(√2 π s), where s is the Fresnel
-    parameter (u/u_c − 1)·R·√(2β/π): 5 % of it is reached only near 31 cycles/mm. Ten per cent,
-    above the tail of two distances, is passed within a Fresnel width of 22.4.
-    """
-    response = distant(METHOD_A)
-    edge = 25 * 2.816 / math.pi
-    width = edge / (2.816 * math.sqrt(2 * 25 / math.pi))  # Δu of s = 1
-    assert cut_off(response.frequency, response.magnitude, 0.1) == pytest.approx(edge, abs=width)
-    tail = edge * (1 + 1 / (math.sqrt(2) * math.pi * 0.05) / (edge / width))
-    assert edge + width < response.limits.cut_off_cycles_per_mm < tail
-
-
 def fields(beta, distance, x, half_width):
     """(order 0, +1, −1) one-dimensional fields for a plane wave, by scipy's Fresnel integrals."""
     b = math.pi / (WAVELENGTH * distance)

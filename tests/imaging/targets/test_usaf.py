@@ -17,19 +17,6 @@ def box(element):
     return y - half, y + half, x - half, x + half
 
 
-def crop(image, element, pixels_per_chart, periods=3):
-    """That many periods of the profile across the bars, and its spread along their inner part."""
-    (y, x), bar = element.centre, element.bar * pixels_per_chart
-    if element.orientation == "horizontal":
-        image, y, x = image.T, x, y
-    rows, columns = image.shape
-    middle = y * pixels_per_chart + rows / 2
-    start = round(x * pixels_per_chart + columns / 2 - 2.5 * bar)
-    band = image[round(middle - 2 * bar) : round(middle + 2 * bar)]
-    band = band[:, start : start + round(2 * bar * periods)]
-    return band.mean(axis=0), np.ptp(band, axis=0).max()
-
-
 def test_layers_hold_an_even_and_an_odd_group_in_both_orientations():
     elements = usaf1951_elements(layers=2)
     labels = {(e.group, e.element, e.orientation) for e in elements}
@@ -92,21 +79,6 @@ def test_the_centroid_is_that_of_the_elements():
         found_x = (image.sum(axis=0) @ columns) / image.sum() / width
         assert found_y == pytest.approx(area @ y / area.sum(), abs=1e-4)
         assert found_x == pytest.approx(area @ x / area.sum(), abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    "element", usaf1951_elements(1), ids=lambda e: f"{e.group},{e.element},{e.orientation}"
-)
-def test_the_spectrum_of_a_set_peaks_at_its_frequency(element):
-    """With bars of 8 pixels, three periods of the profile are 48 pixels, at any sub-pixel shift."""
-    width = 8 / element.bar
-    image = usaf1951((round(width) + 1, round(width) + 20), layers=1, pixels_per_chart=width)
-    profile, along = crop(image, element, width)
-    spectrum = np.abs(np.fft.rfft(profile - profile.mean()))
-    stated = 2 ** (element.group + (element.element - 1) / 6) * STANDARD_WIDTH / width
-    assert np.argmax(spectrum) / 48 == pytest.approx(stated, rel=1e-9)
-    assert spectrum[3] / 48 == pytest.approx(1 / np.pi, rel=0.02)  # a square wave of duty 1/2
-    assert along == pytest.approx(0.0, abs=1e-12)  # constant along the bars
 
 
 @pytest.mark.parametrize(

@@ -149,19 +149,3 @@ def test_cells_smaller_than_a_pixel(name):
     average = h.reshape(4, fine, 5, fine).mean(axis=(1, 3))
     found = psf_of(mask, 40.0, sensor=tc.Sensor((4, 5), pitch), average=True)
     assert relative_l2(found, average) < 0.01
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["mura", "lenslets"])
-def test_models_are_selected(name):
-    """The prediction is kept, and the models offered are those that can hold the mask."""
-    camera = tc.LenslessCamera(families.masks()[name], SENSOR, DISTANCE)
-    light = {"wavelength": WAVELENGTH, "object_distance": 40.0}
-    choice = tc.choose_model(camera, **light, tolerance=1e-4, pixel_integration=False)
-    assert choice.meets_tolerance
-    found = tc.psf(camera, **light, model=choice.method, pixel_integration=False)
-    exact = psf_of(camera.mask, 40.0)
-    assert relative_l2(np.asarray(found), exact) <= choice.predicted_error
-    offered = {prediction.method.model for prediction in choice.considered}
-    assert not offered & {"closed_form", "paraxial"}
-    assert ("geometric" in offered) == (name != "lenslets")

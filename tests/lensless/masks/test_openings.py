@@ -1,6 +1,5 @@
 """Pinholes, rings, lenslets, reliefs, and masks from numbers and files."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -39,22 +38,6 @@ def test_gradients_of_rings():
         direction = jnp.zeros(6).at[i].set(1.0)
         expected = finite_difference(value, start, direction, 1e-6)
         np.testing.assert_allclose(found[i], expected, rtol=1e-5)
-
-
-@pytest.mark.thorough
-def test_light_behind_rings_arrives():
-    """All that passes them falls on a sensor that is wide enough; vmap is a loop."""
-    mask = tc.RadialMask([1.0, 0.0, 0.5], 0.05)
-    passed = np.pi * 0.05**2 * (1 + 0.25 * (9 - 4))
-
-    def one(distance):
-        camera = tc.LenslessCamera(mask, tc.Sensor((100, 104), 5e-3), distance)
-        method = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(64, 64))
-        return tc.psf(camera, wavelength=500e-6, model=method, pixel_integration=True)
-
-    several = jax.jit(jax.vmap(one))(jnp.asarray([1.0, 2.0]))
-    np.testing.assert_allclose(several[0], one(1.0), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(several.sum(axis=(1, 2)) * 5e-3**2 / passed, 1, rtol=0.02)
 
 
 def test_a_lens_focuses():

@@ -131,6 +131,20 @@ def about_ray(camera, angle, azimuth, model, samples=None, averaged=False, **met
     return np.asarray(psf_about_ray(camera, 500 * nm, INF, at, own), float)
 
 
+@pytest.mark.full_size
+@pytest.mark.parametrize(("angle", "most"), [(20, 0.01), (30, 0.02)])
+def test_averages_of_the_full_size(angle, most):
+    """5.632 mm, pixels of 11 µm; more samples change the angular spectrum by 0.15 %."""
+    mask = tc.FresnelZoneAperture(25.0, 0.3, width=5.632)
+    camera = cast(tc.LenslessCamera(mask, tc.Sensor((576, 576), 11 * um), 6.5), "float32")
+    with jax.numpy_dtype_promotion("standard"):
+        found = about_ray(camera, angle, 45, "separable", averaged=True)
+        exact = about_ray(camera, angle, 45, "angular_spectrum", 5, averaged=True)
+        axis = about_ray(camera, 0, 0, "separable", averaged=True)
+    assert relative(found, exact) < most
+    assert relative(axis, exact) > 20 * most
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("angle", "most", "axis"), [(20, 0.006, 1), (-20, 0.006, 0), (30, 0.008, 0)]

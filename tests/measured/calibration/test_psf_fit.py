@@ -182,19 +182,6 @@ def test_model_of_a_synthesis_is_the_sum_of_pictures():
 
 
 @pytest.mark.thorough
-def test_a_fringe_scanned_picture():
-    """It is complex; its background has cancelled."""
-    fit = fit_psf(synthesised(FRINGE_SCANNED), START, **LIGHT)
-    assert fit.status == "ok" and "background" not in fit.names
-    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
-    np.testing.assert_allclose(fit.camera.mask.beta, 30.0, rtol=1e-4)
-    assert fit.residual.dtype == np.complex128
-    # Noise of 30 dB of each of the four, two in each part.
-    residual = np.asarray(fit.residual)
-    assert np.std(residual.real) == pytest.approx(np.std(residual.imag), rel=0.05)
-
-
-@pytest.mark.thorough
 def test_phases_in_reverse_order_are_named_and_fitted():
     image = synthesised({-phase: weight for phase, weight in FRINGE_SCANNED.items()})
     fit = fit_psf(image, START, **LIGHT)
