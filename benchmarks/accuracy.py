@@ -36,14 +36,13 @@ from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
 from thincam_jax.lensless.method import SAMPLED, PsfMethod, models_of, psf_method
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.resolve import psf_cost
 from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
-from thincam_jax.studies.simulate import stacked, take
+from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor, stacked, take
 from thincam_jax.studies.study import Method, Study, Target
 
 SIZES, CAPTURE_SIZE = (128, 256, 512), 256  # and the sensor's own, where it is smaller

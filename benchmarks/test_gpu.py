@@ -15,8 +15,8 @@ import skimage.data
 
 import thincam_jax as tc
 from benchmarks import test_public
-from thincam_jax.learn.denoiser.crops import Crops
 from thincam_jax.learn.denoiser.network import Denoiser
+from thincam_jax.learn.denoiser.reconstructions import Crops
 from thincam_jax.learn.denoiser.train import loss
 from thincam_jax.units import nm, um
 

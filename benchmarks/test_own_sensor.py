@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.landscape import evaluate_grid
 from thincam_jax.design.problem import _exact_count
 from thincam_jax.design.search import best_apart, evaluate, improved
+from thincam_jax.design.setup import Quadrant
 
 ROOT = Path(__file__).parents[1]
 SENSORS = {"375x500, 11 um": (375, 500, 11e-3), "1500x2000, 3.45 um": (1500, 2000, 3.45e-3)}

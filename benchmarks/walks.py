@@ -95,10 +95,10 @@ def take() -> Callable[[], Any]:
     """One exposure of a study."""
     from thincam_jax.commands.kinds import load_experiment
     from thincam_jax.commands.study.build import build_study
-    from thincam_jax.studies import simulate
+    from thincam_jax.studies import evaluate
 
     study = build_study(load_experiment(PACKAGE.parent / "configs/quick.yaml"))
-    return lambda: simulate.take(study, study.exposures[0], study.targets[0])
+    return lambda: evaluate.take(study, study.exposures[0], study.targets[0])
 
 
 def yaml_to_fringe() -> Callable[[], Any]:

@@ -11,6 +11,8 @@ import textwrap
 from importlib.metadata import files
 from pathlib import Path
 
+from PIL import Image
+
 DOCS = Path(__file__).parent
 PACKAGE = DOCS.parent / "thincam_jax"
 
@@ -64,7 +66,7 @@ sphinx_gallery_conf = {
     "plot_gallery": "FAST" not in os.environ,
     "download_all_examples": False,
     "remove_config_comments": True,
-    "thumbnail_size": (600, 400),
+    "thumbnail_size": (400, 400),
     "write_computation_times": False,  # a table that asks other machines for its scripts
 }
 
@@ -99,7 +101,7 @@ MODULES = (
     "hardware.acquisition.plan",
     "hardware.acquisition.taker",
     "hardware.base",
-    "hardware.displays.phase_levels",
+    "hardware.displays.levels",
     "hardware.virtual.optics",
     "hardware.virtual.rig",
     "imaging.metrics.mtf",
@@ -122,7 +124,7 @@ MODULES = (
     "learn.refocusing.use",
     "learn.training",
     "lensless.masks.display",
-    "lensless.masks.reliefs",
+    "lensless.masks.phase",
     "lensless.phase_shift",
     "lensless.propagation.angular_spectrum",
     "measured.bayer",
@@ -189,7 +191,8 @@ def reference_page(package: str, seen: set[tuple[str, str]]) -> str:
                 if (module, alias.name) not in seen:
                     seen.add((module, alias.name))
                     groups.setdefault(heading(package, module), []).append(alias.name)
-    lines = [package, "=" * len(package), ""]
+    title = package.replace(f"{TOP}.", "tc.")  # short enough for the sidebar
+    lines = [title, "=" * len(title), ""]
     if package == TOP:
         lines += ["The names that most programs need, by ``import thincam_jax as tc``.", ""]
     else:
@@ -257,5 +260,75 @@ def to_rst(app, what, name, obj, options, lines):
     lines[:] = MARKUP.sub(escape, text).split("\n")
 
 
+# A script's card in the gallery is one square of a figure of docs/images: left, top and side in
+# pixels. The scripts' figures have many panels, which nobody could read at that size.
+CARDS = {
+    "calibrate_psf": ("calibration.png", 402, 66, 186),
+    "colour_sensor": ("rig-colour.png", 362, 66, 192),
+    "compare_masks": ("masks.png", 185, 20, 147),
+    "denoiser": ("denoiser.png", 0, 0, 418),
+    "field_design": ("field-design.png", 770, 28, 299),
+    "field_of_view": ("field-of-view.png", 700, 727, 104),
+    "first_image": ("first-image.png", 969, 31, 273),
+    "flatcam": ("flatcam.png", 956, 389, 287),
+    "free_form_design": ("free-form-masks.png", 127, 0, 127),
+    "gradients_through_the_solver": ("solver-gradients.png", 126, 12, 399),
+    "in_a_notebook": ("usaf-1951.png", 1182, 326, 186),
+    "learned_refocus": ("learned.png", 631, 42, 194),
+    "moving_objects": ("moving-objects.png", 592, 31, 256),
+    "optical_chart": ("optical-chart-lines.png", 880, 30, 220),
+    "own_sensor": ("design-landscape.png", 169, 4, 369),
+    "phase_mask": ("phase-masks.png", 800, 345, 162),
+    "prior": ("prior.png", 1016, 48, 294),
+    "real_capture": ("real-capture.png", 676, 52, 140),
+    "refocus": ("depth.png", 1032, 60, 150),
+    "screen_distance": ("screen-distance.png", 708, 25, 385),
+    "simulated_rig": ("rig.png", 707, 27, 280),
+    "speed_for_accuracy": ("accuracy.png", 40, 40, 752),
+    "stis_camera": ("stis.png", 629, 37, 199),
+    "sts_camera": ("sts-camera.png", 604, 23, 216),
+    "sts_conditions": ("sts-conditions.png", 351, 23, 105),
+    "sts_design": ("screen-design.png", 24, 0, 374),
+    "sts_realtime": ("sts-speed.png", 575, 0, 418),
+    "superresolution": ("usaf-1951.png", 948, 99, 205),
+    "three_lines": ("three-lines.png", 787, 84, 207),
+    "video": ("video.png", 854, 21, 223),
+    "when_it_looks_wrong": ("when-it-looks-wrong.png", 47, 826, 258),
+    "your_own_mask": ("own-mask.png", 715, 40, 194),
+}
+
+
+def draw_cards(app) -> None:
+    """Put each script's square in place of the picture that the gallery has made."""
+    side = sphinx_gallery_conf["thumbnail_size"]
+    for script in (DOCS.parent / "experiments").glob("*.py"):
+        name, left, top, size = CARDS[script.stem]
+        figure = Image.open(DOCS / "images" / name).convert("RGBA")
+        panel = figure.crop((left, top, left + size, top + size))
+        card = Image.new("RGBA", panel.size, "white")
+        card.alpha_composite(panel)
+        thumbnail = DOCS / "gallery/images/thumb" / f"sphx_glr_{script.stem}_thumb.png"
+        card.convert("RGB").resize(side, Image.Resampling.BICUBIC).save(thumbnail)
+
+
+def describe_names(app, docname: str, text: list[str]) -> None:
+    """Make of each task's names in the list of the reference a table with their first lines."""
+
+    def table(task: re.Match) -> str:
+        prefix = "hardware.plans." if "functions of" in task[2] else ""
+        listed, _, functions = task[2].partition(", and the functions of `tc.hardware.plans`:")
+        names = [name.removeprefix("tc.") for name in re.findall(r"`(.+?)`", listed)]
+        names += [prefix + name for name in re.findall(r"`(.+?)`", functions)]
+        lines = [".. currentmodule:: thincam_jax", "", ".. autosummary::", ""]
+        lines += [f"   {name}" for name in names]
+        return "\n".join([f"### {task[1]}", "", "```{eval-rst}", *lines, "```", ""])
+
+    bullets = re.compile(r"^- \*\*(.+?)\*\*: ((?:.+\n  )*.+\.)$", re.MULTILINE)
+    if docname == "api/index":
+        text[0] = bullets.sub(table, text[0])
+
+
 def setup(app):
+    app.connect("source-read", describe_names)
     app.connect("autodoc-process-docstring", to_rst)
+    app.connect("builder-inited", draw_cards, priority=900)  # after the gallery, at 500

@@ -5,8 +5,6 @@ How far is the mask from the sensor, and where is its middle? A drawing says so 
 cent, which is far too coarse to reconstruct with. One noisy picture of a distant point says it.
 """
 
-# sphinx_gallery_thumbnail_path = "images/calibration.png"
-
 import os
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Each pixel of a Bayer mosaic sees one primary alone. Zones at least two pixels w
 sampled in red and blue, and each colour is reconstructed with the PSF of its own wavelength.
 """
 
-# sphinx_gallery_thumbnail_path = "images/rig-colour.png"
-
 import os
 from pathlib import Path
 

@@ -6,8 +6,6 @@ image of a photograph, of text and of points, in much and in little light, and c
 before? At full size some six minutes of one core. Lengths are in mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/which-mask.png"
-
 import os
 from pathlib import Path
 
@@ -24,7 +22,7 @@ from thincam_jax.imaging.targets import middle_square, sample_image
 from thincam_jax.imaging.targets.patterns import point_grid
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence, random_cells
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": large pixels, in seconds

@@ -9,8 +9,6 @@ light, of which reconstructions are made, and in sRGB values, which FFDNet was t
 σ is in parts of the range 0 to 1.
 """
 
-# sphinx_gallery_thumbnail_path = "images/denoiser.png"
-
 import importlib.util
 import os
 import time

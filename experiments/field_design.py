@@ -8,8 +8,6 @@ edge of the field, and would another distance or another β be better for the fi
 Lengths are in mm, β in rad/mm², frequencies in cycles per mm of the object.
 """
 
-# sphinx_gallery_thumbnail_path = "images/field-design.png"
-
 import math
 import os
 from pathlib import Path

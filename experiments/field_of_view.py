@@ -10,8 +10,6 @@ which can be given the PSF of every point.
 Lengths are in mm, β in rad/mm².
 """
 
-# sphinx_gallery_thumbnail_path = "images/field-of-view.png"
-
 import math
 import os
 from pathlib import Path

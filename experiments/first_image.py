@@ -11,8 +11,6 @@ Equation numbers are those of the thesis that the project rests on, with its sig
 Lengths are in mm, β in rad/mm².
 """
 
-# sphinx_gallery_thumbnail_path = "images/first-image.png"
-
 import math
 import os
 from pathlib import Path

@@ -8,8 +8,6 @@ has all colours? Two masks of one maximum length sequence answer: "product" (ope
 codes are) and "xor" (open where one is, twice the light, the usual choice).
 """
 
-# sphinx_gallery_thumbnail_path = "images/flatcam.png"
-
 import os
 from pathlib import Path
 

@@ -7,8 +7,6 @@ light, each beside a random search of equal cost, and judged on photographs that
 Lengths are in mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/free-form-design.png"
-
 import functools
 import os
 from pathlib import Path

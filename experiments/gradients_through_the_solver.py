@@ -6,8 +6,6 @@ on: the weight τ, the captures, the PSF and so the camera's own numbers. Here a
 known chart corrects the β that the mask was printed with, and finds the best τ on the way.
 """
 
-# sphinx_gallery_thumbnail_path = "images/solver-gradients.png"
-
 import math
 import os
 from pathlib import Path

@@ -6,8 +6,6 @@ pictures; then two masks of a thin camera: which β are best, how exactly they m
 the objective looks like around them, and what thickness buys. Every number may be another one.
 """
 
-# sphinx_gallery_thumbnail_path = "images/design-landscape.png"
-
 import os
 
 import jax

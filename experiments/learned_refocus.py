@@ -11,8 +11,6 @@ far it may be trusted. `thincam train configs/learned_refocus.yaml` trains the f
 Lengths are in mm, β in rad/mm².
 """
 
-# sphinx_gallery_thumbnail_path = "images/learned.png"
-
 import os
 from pathlib import Path
 

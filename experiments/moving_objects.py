@@ -6,8 +6,6 @@ it move until fewer captures are better? All methods take the same time and the 
 capture blurs along the whole way; of several each blurs less, but they disagree on the place.
 """
 
-# sphinx_gallery_thumbnail_path = "images/moving-objects.png"
-
 import os
 from dataclasses import replace
 from pathlib import Path

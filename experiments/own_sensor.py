@@ -8,8 +8,6 @@ matter, and beside it the pair of the thesis and as many random designs.
 Lengths are in mm, β in rad/mm².
 """
 
-# sphinx_gallery_thumbnail_path = "images/design-landscape.png"
-
 import os
 from pathlib import Path
 

@@ -8,8 +8,6 @@ by gradient with the levels that can be made. It sets both beside a diffuser and
 lenses, and asks what few levels, broad light and dispersion cost. Lengths are in mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/phase-masks.png"
-
 import os
 from pathlib import Path
 
@@ -35,7 +33,7 @@ from thincam_jax.imaging.refractive_index import CauchyIndex, ConstantIndex
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.masks import MaskBlank
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import diffuser, voronoi_fresnel
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds

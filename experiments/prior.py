@@ -10,8 +10,6 @@ chosen with the scene at hand, which a user cannot do.
 Lengths are in mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/prior.png"
-
 import os
 from pathlib import Path
 

@@ -5,8 +5,6 @@ A lensless camera sees a distant point of light as its PSF. With a picture of th
 capture, the image follows; and the capture itself says whether the PSF is the right one.
 """
 
-# sphinx_gallery_thumbnail_path = "images/real-capture.png"
-
 import os
 from dataclasses import replace
 from pathlib import Path

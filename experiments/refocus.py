@@ -6,8 +6,6 @@ show. Half of a picture stands at 80 mm and half at 140 mm: how far away is each
 picture that is sharp everywhere look like?
 """
 
-# sphinx_gallery_thumbnail_path = "images/depth.png"
-
 import math
 import os
 from pathlib import Path

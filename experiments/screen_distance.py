@@ -6,8 +6,6 @@ ghosts are displaced. One capture then tells the distance of a flat object, with
 status. When does it, and when not?
 """
 
-# sphinx_gallery_thumbnail_path = "images/screen-distance.png"
-
 import os
 from pathlib import Path
 

@@ -8,8 +8,6 @@ protocols: the camera USB3 Vision, the stage Zaber's ASCII. `thincam capture` do
 an experiment file.
 """
 
-# sphinx_gallery_thumbnail_path = "images/rig.png"
-
 import os
 import tempfile
 from pathlib import Path

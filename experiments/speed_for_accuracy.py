@@ -13,8 +13,6 @@ Fresnel integrals, without any sampling. Equation numbers are those of the thesi
 mm, β in rad/mm².
 """
 
-# sphinx_gallery_thumbnail_path = "images/accuracy.png"
-
 import os
 import statistics
 import time

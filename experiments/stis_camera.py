@@ -6,8 +6,6 @@ bare sensor behind the top hologram make it thinner. It gives no equations. What
 camera see, what do the screen's ghosts do to it, and how well does an image come back?
 """
 
-# sphinx_gallery_thumbnail_path = "images/stis.png"
-
 import os
 from functools import partial
 from pathlib import Path

@@ -11,8 +11,6 @@ The thesis gives d0 = 6 mm, 61.2°, 532 nm and the holograms' sizes. It does not
 on the plate the holograms are: these are assumptions.
 """
 
-# sphinx_gallery_thumbnail_path = "images/sts-camera.png"
-
 import os
 from pathlib import Path
 

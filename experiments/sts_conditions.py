@@ -5,8 +5,6 @@ The thesis' calibrated screen reconstructs six pictures on a monitor at 9.6 to 1
 The same steps on a virtual rig give 41 dB. Which conditions of a real set-up explain that?
 """
 
-# sphinx_gallery_thumbnail_path = "images/sts-conditions.png"
-
 import functools
 import os
 from pathlib import Path

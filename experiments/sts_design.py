@@ -7,8 +7,6 @@ they are chosen: by gradient, for the least expected error of the reconstruction
 be made, and then simulated in full beside the defaults.
 """
 
-# sphinx_gallery_thumbnail_path = "images/screen-design.png"
-
 import os
 from dataclasses import replace
 from pathlib import Path

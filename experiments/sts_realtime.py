@@ -7,8 +7,6 @@ that moves (an open problem of the thesis)? A measured matrix H of 440² pixels 
 and how many images a second does it allow?
 """
 
-# sphinx_gallery_thumbnail_path = "images/sts-speed.png"
-
 import os
 import time
 from pathlib import Path

@@ -10,8 +10,6 @@ Equation numbers are those of the thesis, its signs and factors corrected. Lengt
 in rad/mm², spatial frequencies in cycles/mm on the sensor at d = 6.5 mm.
 """
 
-# sphinx_gallery_thumbnail_path = "images/usaf-1951.png"
-
 import math
 import os
 from pathlib import Path

@@ -7,8 +7,6 @@ point of the scene casts the whole aperture's shadow. The prior of the image is 
 the package brings.
 """
 
-# sphinx_gallery_thumbnail_path = "images/three-lines.png"
-
 import os
 from pathlib import Path
 

@@ -6,8 +6,6 @@ seconds. A stream goes on from the image before, four iterations a frame; a Wien
 anew. How many images a second does each give, and what do they lose where the scene moves?
 """
 
-# sphinx_gallery_thumbnail_path = "images/video.png"
-
 import os
 import time
 from pathlib import Path

@@ -5,8 +5,6 @@ What mistakes in the input look like, and what the program says of them. One pho
 random mask, a colour sensor of 12 bit; everything else is the default.
 """
 
-# sphinx_gallery_thumbnail_path = "images/when-it-looks-wrong.png"
-
 import os
 import textwrap
 import warnings

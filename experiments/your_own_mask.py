@@ -8,8 +8,6 @@ no two pairs of marks are the same distance apart, so that its autocorrelation h
 sidelobe. How wide are its slits to be?
 """
 
-# sphinx_gallery_thumbnail_path = "images/masks.png"
-
 import os
 from pathlib import Path
 

@@ -45,6 +45,20 @@ def full_disk(size: int) -> Iterator[None]:
         sys.dont_write_bytecode = writes
 
 
+def point_psf(camera: Any, **how: Any) -> jax.Array:
+    """`tc.psf` at the pixels' centres, not averaged over them."""
+    import thincam_jax as tc
+
+    return tc.psf(camera, pixel_integration=False, **how)
+
+
+def point_otf(camera: Any, **how: Any) -> jax.Array:
+    """`tc.otf` of the PSF at the pixels' centres."""
+    import thincam_jax as tc
+
+    return tc.otf(camera, pixel_integration=False, **how)
+
+
 def read_fiducial(pixels: Any, bit_depth: int) -> Any:
     """The fiducial that a virtual rig writes into the corner of a frame."""
     from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Fiducial
@@ -71,6 +85,11 @@ def quick(values: Iterable, *places: int) -> list:
         )
         for place, value in enumerate(values)
     ]
+
+
+def rows(table: str) -> list[tuple[str, ...]]:
+    """Rows of a test's table: a line each, with " | " between the columns."""
+    return [tuple(cell.strip() for cell in row.split(" | ")) for row in table.strip().split("\n")]
 
 
 def in_full(small: Any, large: Any) -> list:

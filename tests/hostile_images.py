@@ -36,13 +36,12 @@ from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.imaging.targets.patterns import point_grid, slanted_edge
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence
-from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
+from thincam_jax.lensless.masks.phase import voronoi_fresnel
 from thincam_jax.lensless.phase_shift import harmonic_otf
 from thincam_jax.measured import calibration
 from thincam_jax.measured.exposures import ExposedFrames, merge_exposures
 from thincam_jax.reconstruction import depth
-from thincam_jax.reconstruction.depth.find import depth_of_colours, object_regions
-from thincam_jax.reconstruction.depth.focus import focus_measure
+from thincam_jax.reconstruction.depth.find import depth_of_colours, focus_measure, object_regions
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 from thincam_jax.waveguide.measured.screen_fit import GhostPositions
 

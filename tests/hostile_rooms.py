@@ -28,8 +28,8 @@ from thincam_jax.design.ranking import score_design
 from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
 from thincam_jax.hardware import plans
-from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
+from thincam_jax.hardware.acquisition.taker import AutoExposure, find_exposure
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage

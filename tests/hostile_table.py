@@ -13,7 +13,7 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.refractive_index import bk7
 from thincam_jax.lensless.masks import MaskBlank, UniformlyRedundantArray, random_cells
-from thincam_jax.lensless.masks.reliefs import diffuser
+from thincam_jax.lensless.masks.phase import diffuser
 from thincam_jax.lensless.phase_shift import fringe_scanned_otf, phase_pair_otf
 from thincam_jax.plot.explorer import Explorer
 from thincam_jax.units import deg, nm, um

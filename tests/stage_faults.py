@@ -10,11 +10,10 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from thincam_jax.hardware.base import Stage
-from thincam_jax.hardware.errors import Disconnected, HardwareError, NotHomed, ProtocolError
+from thincam_jax.hardware.base import Disconnected, HardwareError, NotHomed, ProtocolError, Stage
 from thincam_jax.hardware.stages.grbl import GrblStage
 from thincam_jax.hardware.stages.zaber import ZaberStage
-from thincam_jax.hardware.virtual.faults import Fault
+from thincam_jax.hardware.virtual.devices import Fault
 from thincam_jax.hardware.virtual.grbl import VirtualGrbl
 from thincam_jax.hardware.virtual.serial_device import Motion, VirtualSerialDevice
 from thincam_jax.hardware.virtual.zaber import VirtualZaber

@@ -1,16 +1,12 @@
 """The pages say what is so: their examples run, and what they name is there."""
 
 import ast
-import inspect
 import json
-import operator
 import os
 import re
 import runpy
 import shlex
-import tomllib
 from pathlib import PurePosixPath
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +23,7 @@ from helpers import ROOT
 from thincam_jax.commands import cli
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.learn.commands.refocusing import build_camera
-from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.measured.write import log_text
-from thincam_jax.units import nm, um
 
 PACKAGE = ROOT / "thincam_jax"
 
@@ -230,19 +223,6 @@ def test_every_equation_that_a_file_cites_has_its_row():
     assert not missing, "docs/theory/thesis.md lacks a row for:\n" + "\n".join(missing)
 
 
-@pytest.mark.parametrize(
-    ("text", "numbers"),
-    [
-        ("(thesis Eq 3.14-3.16 with", {"3.14", "3.15", "3.16"}),
-        ("thesis Eq 3.14 and 3.31, corrected; ε = 3.5", {"3.14", "3.31"}),
-        ("Eq 3.11,\n    3.12 with", {"3.11", "3.12"}),
-        ("IEEE 3, 384, 2017, Eq 3)", set()),
-    ],
-)
-def test_citations_are_read(text, numbers):
-    assert cited(text) == numbers
-
-
 @pytest.mark.thorough
 def test_flatcam_page():
     names = run_examples("docs/guide/flatcam.md")
@@ -346,45 +326,6 @@ def test_picture_of_the_rooms_is_of_today():
 
 
 @pytest.mark.thorough
-def test_picture_of_the_rooms_can_be_drawn(tmp_path):
-    script = runpy.run_path(str(ROOT / "docs/draw_rooms.py"))
-    today = {room: used for room, (_, used) in script["rooms_and_imports"]().items()}
-    script["draw"](tmp_path / "rooms.png")
-    assert script["imports_drawn"](tmp_path / "rooms.png") == today
-
-
-@pytest.mark.thorough
-def test_learned_thesis_page(monkeypatch):
-    """What the page says of the optics of both cameras; at small size, too, the thesis' planes are
-    not told apart, and those here are."""
-    page = (ROOT / "docs/measured/refocusing_thesis.md").read_text("utf-8")
-    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
-        script = runpy.run_path(str(ROOT / "benchmarks/refocusing/thesis_refocusing.py"))
-        thesis, optics = script["thesis_camera"], script["optics"]
-        path = ROOT / "configs/learned_refocus.yaml"
-        here = build_camera(load_experiment(path, (), "train"))
-        for camera, distances in ((thesis(256), script["THESIS"]), (here, (60.0, 120.0))):
-            found = optics(camera, distances)
-            row = [f"{found['depth of focus']:.0f} mm", f"{found['wider']:.2g}"]
-            assert f"| {' | '.join(row)} | {found['difference']:.2f} |" in page
-        assert (
-            round(float(script["axial_resolution"](thesis(2048).camera, object_distance=160.0)))
-            == 46
-        )
-        leaves = list(script["dead_leaves"](7, 4, 32).astype(float))
-
-        def lost(camera, distances):
-            runs = {"Wiener": script["baselines"](camera).wiener}
-            return np.mean(script["table"](camera, runs, leaves, 2, distances))
-
-        mask = tc.FresnelZoneAperture(beta=3.2, width=5.6)
-        thin = tc.LenslessCamera(mask, tc.Sensor((64, 64), 176 * um), 7.5)
-        able = RefocusCamera(thin, 500 * nm, field_shape=(32, 32), near=50.0, far=200.0)
-        assert abs(lost(thesis(64), script["THESIS"])) < 0.05
-        assert lost(able, (60.0, 120.0)) > 0.5
-
-
-@pytest.mark.thorough
 def test_screen_page(capsys):
     names = run_examples("docs/guide/screen.md")
     np.testing.assert_allclose(names["rays"].wavelength / 1e-6, [532, 564.729], atol=1e-3)
@@ -456,12 +397,6 @@ def test_a_section_of_a_page_fits_into_an_experiment(file, key, value):
     assert getattr(config, key)
 
 
-@pytest.mark.parametrize("text", [text for _, text in blocks("toml")])
-def test_what_a_page_shows_of_a_project_file_can_be_read(text):
-    (groups,) = tomllib.loads(text)["project"].values()
-    assert all(group.startswith("thincam_jax.") for group in groups)
-
-
 def command_lines():
     """Page and words of each call of the command in a page."""
     for page, text in blocks("sh", ""):
@@ -480,111 +415,3 @@ def test_a_command_of_a_page_has_these_options_and_files(words):
     given = {word.strip("[]").split("=")[0] for word in words if re.match(r"\[?--", word)}
     assert given <= known
     assert all((ROOT / word).is_file() for word in words if word.startswith("configs/"))
-
-
-def assigned(name: str) -> ast.expr:
-    """The value of a constant of docs/conf.py."""
-    conf = ast.parse((ROOT / "docs/conf.py").read_text("utf-8"))
-    (value,) = (
-        node.value
-        for node in conf.body
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
-    )
-    return value
-
-
-def public(module: str, name: str) -> bool:
-    """Whether the reference lists a module, or a sub-package that is imported by its name."""
-    listed = assigned("PACKAGES")
-    assert isinstance(listed, ast.Tuple)
-    packages = {"thincam_jax", "thincam_jax.units"}
-    packages |= {one.value for one in listed.elts if isinstance(one, ast.Constant)}
-    packages |= {f"thincam_jax.{one}" for one in ast.literal_eval(assigned("MODULES"))}
-    return module in packages or f"{module}.{name}" in packages
-
-
-def test_the_reference_names_what_packages_export():
-    """By the program of docs/conf.py itself, without what needs Sphinx."""
-    path = ROOT / "docs/conf.py"
-    conf = ast.parse(path.read_text("utf-8"))
-    constants = {"DOCS", "PACKAGE", "TOP", "PACKAGES", "MODULES", "ROOMS"}
-    conf.body = [
-        node
-        for node in conf.body
-        if isinstance(node, ast.Import | ast.ImportFrom | ast.FunctionDef)
-        or (isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in constants)
-    ]
-    program: dict[str, Any] = {"__file__": str(path)}
-    exec(compile(conf, path, "exec"), program)
-    seen = set()
-    pages = {one: program["reference_page"](one, seen) for one in program["PACKAGES"]}
-    assert "   PlugAndPlay\n" in pages["thincam_jax"]
-    assert "   residual_noise\n" not in "".join(pages.values())
-    listed = [
-        f"{package}.{name}"
-        for package, page in pages.items()
-        for name in re.findall(r"^   (\w+)$", page, re.MULTILINE)
-    ]
-    assert sorted(listed) == sorted(promised(packages=False))
-    assert {f"thincam_jax.{name}" for name in program["MODULES"]}.isdisjoint(pages)
-    assert "   find_plate\n" in program["modules_page"]()
-
-
-def promised(packages=True) -> list[str]:
-    """The list of docs/api/index.md: names that versions keep, by task."""
-    text = (ROOT / "docs/api/index.md").read_text("utf-8").split("by task")[1].split("What they")[0]
-    rows = [row for row in text.split("\n- ") if packages or not row.startswith("**Packages**")]
-    found = [name for row in rows for name in re.findall(r"`tc\.([\w.]+)`", row)]
-    return [f"thincam_jax.{name}" for name in found]
-
-
-def exported() -> list[str]:
-    """What the packages export: `X as X` in their `__init__` files."""
-    found = []
-    for path in sorted(PACKAGE.rglob("__init__.py*")):
-        package = ".".join(path.parent.relative_to(ROOT).parts)
-        for node in ast.parse(path.read_text("utf-8")).body:
-            if isinstance(node, ast.ImportFrom):
-                found += [f"{package}.{one.name}" for one in node.names if one.asname == one.name]
-    return found
-
-
-def test_versions_keep_few_names_and_these():
-    """The list of the reference is what the packages export; a new name replaces another."""
-    assert sorted(promised()) == sorted(exported())
-    assert len(promised()) <= 180
-    assert len([name for name in promised() if name.count(".") == 1]) <= 60
-    for name in promised():
-        assert operator.attrgetter(name.removeprefix("thincam_jax."))(tc) is not None
-    rig = (ROOT / "docs/api/index.md").read_text("utf-8").split("functions of `tc.hardware.plans`:")
-    plans = {name: one for name, one in vars(tc.hardware.plans).items() if inspect.isfunction(one)}
-    made_there = [n for n, one in plans.items() if one.__module__ == tc.hardware.plans.__name__]
-    assert re.findall(r"`(\w+)`", rig[1].split("\n\n")[0]) == [n for n in made_there if n[0] != "_"]
-
-
-USERS = [path.read_text("utf-8") for path in sorted((ROOT / "experiments").glob("*.py"))]
-USERS += [
-    "\n".join(re.findall(r"```py(?:thon)?\n(.*?)```", page, re.DOTALL)) for page in pages().values()
-]
-
-
-def test_scripts_and_pages_need_public_modules_only():
-    """What they import, and in the pages' text what is named with its module."""
-    internal = {
-        f"{node.module}.{alias.name}"
-        for text in USERS
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.ImportFrom) and node.module
-        for alias in node.names
-        if node.module.startswith("thincam_jax") and not public(node.module, alias.name)
-    }
-    named = re.findall(r"`(thincam_jax(?:\.\w+)*)\.(\w+)[(`]", "\n".join(pages().values()))
-    internal |= {f"{module}.{name}" for module, name in named if not public(module, name)}
-    assert not internal
-
-
-def test_every_public_name_has_a_heading_in_the_reference():
-    rooms = ast.literal_eval(assigned("ROOMS"))
-    stub = ast.parse((PACKAGE / "__init__.pyi").read_text("utf-8"))
-    modules = {node.module for node in stub.body if isinstance(node, ast.ImportFrom)} - {None}
-    assert not [one for one in modules if not one.startswith(tuple(rooms))]

@@ -7,6 +7,7 @@ import runpy
 
 import jax
 import matplotlib.pyplot as plt
+import PIL.Image
 import pytest
 import skimage.io
 
@@ -15,15 +16,24 @@ from helpers import ROOT
 SCRIPTS = sorted((ROOT / "experiments").glob("*.py"))
 
 
-def test_the_scripts_are_there():
-    assert {"first_image", "superresolution", "speed_for_accuracy"} <= {s.stem for s in SCRIPTS}
-
-
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_a_script_begins_with_a_title(script):
     """Of reStructuredText, and a question or subject that fits below a thumbnail."""
     title, line, blank, *_ = ast.get_docstring(ast.parse(script.read_text("utf-8"))).splitlines()
     assert line == "=" * len(title) and not blank and len(title) < 60
+
+
+def test_every_script_has_a_card_in_the_gallery():
+    """A square within a figure of docs/images."""
+    tree = ast.parse((ROOT / "docs/conf.py").read_text("utf-8"))
+    tables = (one for one in tree.body if isinstance(one, ast.Assign))
+    cards = next(one.value for one in tables if ast.unparse(one.targets[0]) == "CARDS")
+    cards = ast.literal_eval(cards)
+    assert cards.keys() == {script.stem for script in SCRIPTS}
+    for name, left, top, side in cards.values():
+        with PIL.Image.open(ROOT / "docs/images" / name) as figure:
+            width, height = figure.size
+        assert min(left, top) >= 0 and left + side <= width and top + side <= height, name
 
 
 def test_a_study_and_a_design_in_25_lines():

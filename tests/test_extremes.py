@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from extremes import CHOICES, EXTREMES, GRADIENTS, LOST, PARAMETERS, Extreme, find
 from lensless.propagation.reference import chirp_by_quadrature
-from naive_formulas import NAIVE
 
 import thincam_jax as tc
-from helpers import AS_IN_USE, count_traces, finite_difference, quick, relative_l2
+from helpers import AS_IN_USE, ROOT, count_traces, finite_difference, quick, relative_l2
 
 DTYPES = (np.float32, np.float64)
 STATIC = ("shape", "model", "pixel_integration")
@@ -342,17 +341,6 @@ def test_fringes_in_single_precision():
     assert exact_model is not None and exact_model < 1.5e-5
 
 
-def test_curvature_of_the_source_has_no_slope_at_infinity():
-    """π/(λt), which the package does not form: nothing beyond ∞, but no derivative in λ either."""
-
-    def curvature(wavelength):
-        return jnp.pi / (wavelength * jnp.inf)
-
-    assert curvature(500e-6) == 0
-    assert np.isnan(jax.grad(curvature)(500e-6))
-    assert math.isfinite(result(find("t = ∞"), np.float64)[1]["wavelength"])
-
-
 IN_SINGLE = tc.PsfMethod("separable", "float32")
 
 
@@ -390,27 +378,6 @@ def test_predicted_error(name):
     predicted = tc.predict_error(camera, model=IN_SINGLE, **conditions)
     true = error_in_single(name)
     assert true < predicted.predicted_error < 10 * true
-
-
-@pytest.mark.thorough
-@choices
-def test_choice_of_precision(name):
-    """A tolerance that float32 cannot meet chooses float64, which does."""
-    camera, conditions = choice_of(name)
-    choice = tc.choose_model(camera, tolerance=1e-7, **conditions)
-    assert (choice.method.model, choice.method.precision) == ("separable", "float64")
-    assert choice.meets_tolerance
-    assert error(find(name), np.float64) < 1e-7 < error_in_single(name)
-
-
-@pytest.mark.thorough
-def test_predicted_error_where_the_nodes_of_an_average_fail():
-    """Some 60 fringes a pixel are more than 24 nodes follow, in either precision: it is told."""
-    camera, conditions = choice_of("d = 1 mm, pixel average")
-    predicted = tc.predict_error(camera, model=IN_SINGLE, **conditions)
-    true = error_in_single("d = 1 mm, pixel average")
-    assert true <= predicted.predicted_error <= 10 * true
-    assert error(find("d = 1 mm, pixel average"), np.float64) > true / 2
 
 
 def test_every_extreme_is_one_program():
@@ -451,39 +418,44 @@ def test_reference_against_quadrature(order, name, x):
     assert abs(value - exact) < 1e-12 * min(2 * half, math.sqrt(math.pi / max(abs(g + b), 1e-30)))
 
 
-def naive_error(extreme: Extreme, dtype) -> float:
-    with np.errstate(all="ignore"):
-        value = NAIVE[extreme.naive](extreme, dtype).astype(float)
-    if not np.isfinite(value).all():
-        return math.inf
-    return relative_l2(value[:: extreme.every], expected(extreme, dtype))
+def documented(first: str) -> dict[str, list[str]]:
+    """The rows of the table that begins with that cell, by their own first cell."""
+    page = (ROOT / "docs/theory/extremes.md").read_text(encoding="utf-8")
+    table = page[page.index(f"| {first} |") :].split("\n\n")[0].splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
+    assert len({len(row) for row in rows}) == 1
+    return {row[0]: row for row in rows[2:]}
 
 
-@pytest.mark.parametrize(
-    ("extreme", "dtype"), [case(e, e.naive_dtype) for e in EXTREMES if e.naive]
-)
-def test_naive_formula_fails(extreme, dtype):
-    """More than ten times the library's error in the same precision, or not finite."""
-    assert naive_error(extreme, dtype) > 10 * error(extreme, dtype)
+def test_every_extreme_is_documented():
+    """The pages' tables have all of them, in this order, and nothing else."""
+    assert list(documented("extreme")) == [extreme.name for extreme in EXTREMES]
+    assert len({extreme.name for extreme in EXTREMES}) == len(EXTREMES)
+    assert list(documented("gradient at")) == list(GRADIENTS)
 
 
-@pytest.mark.parametrize("name", NAIVE)
-def test_naive_formula_is_right_elsewhere(name):
-    """In double precision at a gentle camera each is the model: it is the extreme that fails it.
+def check_quoted(cell: str, bound: float, floor: float) -> None:
+    """*measured < bound*, two to three times that."""
+    measured, quoted = (float(part) for part in cell.split(" < "))
+    assert quoted == bound
+    assert 2 * measured < bound < 3 * max(measured, floor)
 
-    Measured: 7e-5 for the 1024 samples, 9e-6 for the whole path, 2e-13 and less for the others.
-    """
-    gentle = Extreme(
-        "gentle",
-        0.0,
-        0.0,
-        model="geometric" if name in ("added phase", "pixel's ends") else "separable",
-        pixel_integration=name == "pixel's ends",
-        beta=200.0,
-        width=0.5,
-        distance=20.0,
-        object_distance=60.0,
-        pitch=0.011,
-        naive=name,
-    )
-    assert naive_error(gentle, np.float64) < 2e-4
+
+@pytest.mark.parametrize("extreme", EXTREMES, ids=lambda extreme: extreme.name)
+def test_documented_errors(extreme):
+    """Each bound stands after the measured error, two to three times that, or nine eps."""
+    *_, single_cell, double_cell = documented("extreme")[extreme.name]
+    for dtype, cell in zip((np.float32, np.float64), (single_cell, double_cell), strict=True):
+        check_quoted(cell, getattr(extreme, dtype.__name__), 3 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_documented_gradients(name):
+    """As the values; bold is what is lost, a nought what is zero."""
+    _, *cells = documented("gradient at")[name]
+    for cell, bound in zip(cells, GRADIENTS[name], strict=True):
+        if bound is None:
+            assert cell == "0"
+            continue
+        assert ("**" in cell) == (bound > LOST)
+        check_quoted(cell.replace("**", ""), bound, 0.0)

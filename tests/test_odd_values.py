@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import point_psf
 from thincam_jax import measured
 from thincam_jax._core import checks
 from thincam_jax.imaging import operators
@@ -21,9 +22,7 @@ def zones(beta):
 
 
 def distant(object_distance):
-    return tc.psf(
-        CAMERA, wavelength=500 * nm, object_distance=object_distance, pixel_integration=False
-    )
+    return point_psf(CAMERA, wavelength=500 * nm, object_distance=object_distance)
 
 
 ITSELF: list = []
@@ -45,12 +44,8 @@ NUMBERS = {
     "mask": zones,
     "pitch": lambda value: tc.Sensor((3, 4), value),
     "distance": distant,
-    "wavelength": lambda value: tc.psf(
-        CAMERA, wavelength=value, object_distance=250.0, pixel_integration=False
-    ),
-    "at": lambda value: tc.psf(
-        CAMERA, wavelength=500 * nm, object_distance=250.0, at=value, pixel_integration=False
-    ),
+    "wavelength": lambda value: point_psf(CAMERA, wavelength=value, object_distance=250.0),
+    "at": lambda value: point_psf(CAMERA, wavelength=500 * nm, object_distance=250.0, at=value),
     "shape": lambda value: tc.Sensor(value, 0.06),
     "tau": tc.AdmmTV,
     "snr": tc.GaussianNoise,

@@ -1,9 +1,14 @@
-"""The core on systems without POSIX's modules, such as Windows, in a process that hides them."""
+"""The core on systems without POSIX's modules, such as Windows, in a process that hides them.
+
+The workflows that try it on such systems.
+"""
 
 import subprocess
 import sys
 
+import check_jsonschema
 import pytest
+from click.testing import CliRunner
 
 from helpers import ROOT
 
@@ -75,3 +80,13 @@ def test_the_core_needs_no_posix(tmp_path):
     done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["[]", "True", "True"] + ["0 None"] * 3
+
+
+@pytest.mark.parametrize(
+    ("schema", "files"), [("github-workflows", "workflows/*.yml"), ("dependabot", "dependabot.yml")]
+)
+def test_workflows_are_as_their_schemas_say(schema, files):
+    paths = [str(path) for path in sorted((ROOT / ".github").glob(files))]
+    options = ["--builtin-schema", f"vendor.{schema}", *paths]
+    checked = CliRunner().invoke(check_jsonschema.main, options)
+    assert paths and checked.exit_code == 0, checked.output

@@ -7,7 +7,7 @@ import typing
 
 import numpy as np
 import pytest
-from test_docs import promised
+from test_public_faces import promised
 
 import thincam_jax as tc
 

@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 import thincam_jax as tc
 from thincam_jax.commands import cli
 from thincam_jax.imaging.encoding import ORIENTATION
-from thincam_jax.imaging.operators import Separable
 from thincam_jax.units import nm, um
 
 SHAPE, DARK, FULL = (96, 128), 64, 4095
@@ -113,24 +112,6 @@ def test_a_raw_file_says_pattern_and_levels(tmp_path, image_of):
             image_of(*files, *wrong)
 
 
-@pytest.mark.thorough
-def test_arrays_that_carry_meaning(image_of):
-    """Masks, NaN and other bytes of Python's arrays; NaN in a float file."""
-    light = cells(SHAPE, size=3)
-    given = {name: (one - DARK) / FULL for name, one in pair(light).items()}
-    dead = np.random.default_rng(0).random(SHAPE) < 0.02
-    spoilt = np.where(dead, 50.0, given["capture"])
-    psfs, solver = tc.Psfs(given["psf"][None]), tc.AdmmTV(iterations=60)
-    best = quality(tc.reconstruct(tc.Recording([spoilt], psfs, valid=~dead), solver).image, TRUE)
-    for capture in (np.ma.masked_array(spoilt, dead), np.where(dead, np.nan, spoilt)):
-        capture = capture.astype(">f8")  # as FITS has it
-        image = tc.reconstruct(tc.Recording([capture], psfs), solver).image
-        assert quality(image, TRUE) > best - WITHIN
-    given["capture"] = np.where(dead, np.nan, spoilt)
-    given = {name: one.astype(np.float32) for name, one in given.items()}
-    assert quality(image_of(**given)[0], TRUE) > best - WITHIN
-
-
 def test_numbers_in_place_of_leaves():
     """`eqx.tree_at` puts a Python number where a camera holds an array."""
     mask = tc.FresnelZoneAperture(beta=20.0, width=3.0)
@@ -177,49 +158,6 @@ def test_a_scene_wider_than_the_field():
         assert likeness > 0.9 or "outside of the field: give field_shape=" in result.reason
 
 
-@pytest.mark.thorough
-def test_psf_and_capture_swapped(image_of, tmp_path):
-    given = pair(spots(SHAPE))
-    _, said = image_of(psf=given["capture"], capture=given["psf"])
-    assert said["swapped"]["severe"]
-    words = ["reconstruct", "--strict", "--out", str(tmp_path / "b.npy")]
-    files = ["--psf", str(tmp_path / "psf.tif"), "--capture", str(tmp_path / "capture.tif")]
-    result = CliRunner().invoke(cli.app, words + files)
-    assert result.exit_code == 2 and "exchange --psf and --capture" in result.stderr
-
-
-@pytest.mark.thorough
-def test_hot_pixels_in_a_psf(image_of):
-    given = pair(spots(SHAPE))
-    best = quality(image_of(**given)[0], TRUE)
-    given["psf"].flat[np.random.default_rng(3).choice(TRUE.size, 15, replace=False)] = FULL
-    image, said = image_of(psf=given["psf"])
-    assert quality(image, TRUE) > best - WITHIN and "replaced" in said
-
-
-@pytest.mark.thorough
-def test_a_background_for_each_capture(tmp_path):
-    """As a folder beside that of the captures: ambient light of a gradient each."""
-    light, slope = cells(SHAPE, size=3), np.linspace(0.2, 1, SHAPE[1])
-    for name in ("captures", "backgrounds"):
-        (tmp_path / name).mkdir()
-    tifffile.imwrite(tmp_path / "psf.tif", counts(light, 1))
-    for n in range(2):
-        ambient = np.round((500 + 300 * n) * slope * np.ones(SHAPE))
-        clean = counts(seen(TRUE, light), n, 2400)
-        for name, image in (("captures", clean + ambient), ("backgrounds", DARK + ambient)):
-            tifffile.imwrite(tmp_path / name / f"{n}.tif", image.astype(np.uint16))
-    scores = []
-    for more in ([], ["--background", str(tmp_path / "backgrounds")]):
-        files = ["--psf", str(tmp_path / "psf.tif"), "--capture", str(tmp_path / "captures")]
-        words = ["reconstruct", *files, *more, "--out", str(tmp_path / f"out{len(more)}")]
-        result = CliRunner().invoke(cli.app, [*words, "--iterations", "60"])
-        assert result.exit_code == 0, result.output
-        images = [np.load(tmp_path / f"out{len(more)}" / f"{n}.npy") for n in range(2)]
-        scores.append([quality(image, TRUE) for image in images])
-    assert min(scores[1]) > max(scores[0])
-
-
 @pytest.mark.parametrize("name", [*WRITERS, "a.pgm", "a.raw10", "a.raw12"])
 def test_formats_of_a_laboratory(tmp_path, name):
     """The counts, or one line that gives the Python that reads them."""
@@ -237,21 +175,3 @@ def test_formats_of_a_laboratory(tmp_path, name):
         exec(line, names)
         path = path.with_suffix(".npy")
     np.testing.assert_array_equal(tc.measured.read_image(path).pixels, array)
-
-
-@pytest.mark.thorough
-def test_a_code_as_fine_as_a_pixel():
-    """`Ridge("sure")` finds the noise, not the code."""
-    generator = np.random.default_rng(4)
-    left, right = (
-        np.where(generator.random((n, m)) < 0.5, 1.0, 0.0)
-        for n, m in zip((112, 150), SHAPE, strict=True)
-    )
-    clean = left @ TRUE @ right.T
-    noise = clean.std() / 100
-    capture = clean + noise * generator.normal(size=clean.shape)
-    given = {"noise_variance": noise**2, "background": 0.0}
-    recording = tc.Recording([capture], Separable(left, right), **given)
-    best = quality(tc.reconstruct(recording, tc.Ridge("sure")).image, TRUE)
-    recording = tc.Recording([capture], Separable(left, right))
-    assert quality(tc.reconstruct(recording, tc.Ridge("sure")).image, TRUE) > best - WITHIN

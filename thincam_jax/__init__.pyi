@@ -27,15 +27,15 @@ from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.exposures import Exposures as Exposures
 from .lensless.field import field_operator as field_operator
-from .lensless.masks.cells import SeparableMask as SeparableMask
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
-from .lensless.masks.lenslets import LensletArray as LensletArray
 from .lensless.masks.phase import PhaseMask as PhaseMask
+from .lensless.masks.pinhole import LensletArray as LensletArray
 from .lensless.masks.pinhole import Pinhole as Pinhole
 from .lensless.masks.pinhole import RadialMask as RadialMask
 from .lensless.masks.redundant_arrays import (
     ModifiedUniformlyRedundantArray as ModifiedUniformlyRedundantArray,
 )
+from .lensless.masks.redundant_arrays import SeparableMask as SeparableMask
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import PsfMethod as PsfMethod
@@ -46,7 +46,7 @@ from .lensless.psf import psf as psf
 from .lensless.separable_operator import separable_operator as separable_operator
 from .measured.calibration.psf_fit import fit_psf as fit_psf
 from .measured.calibration.separable import fit_separable as fit_separable
-from .plot.explore import explore as explore
+from .plot.page import explore as explore
 from .reconstruction.fringe_filter import FringeScanning as FringeScanning
 from .reconstruction.imaging_model import Cameras as Cameras
 from .reconstruction.imaging_model import Psfs as Psfs

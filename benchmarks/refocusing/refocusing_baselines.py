@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.linear import LinearStep
-from thincam_jax.learn.refocusing.loss import Parts, relative_error
 from thincam_jax.learn.refocusing.network import constant_images, noise_level
-from thincam_jax.learn.refocusing.planes import Planes
+from thincam_jax.learn.refocusing.planes import LinearStep, Planes
 from thincam_jax.learn.refocusing.scenes import Batch
+from thincam_jax.learn.refocusing.train import Parts, relative_error
 from thincam_jax.learn.refocusing.unet import UNet
 
 

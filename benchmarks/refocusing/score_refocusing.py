@@ -29,8 +29,7 @@ import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.lens_blur import lens_blur
-from thincam_jax.learn.refocusing.scenes import captured
+from thincam_jax.learn.refocusing.scenes import captured, lens_blur
 from thincam_jax.learn.refocusing.sources import photographs
 from thincam_jax.units import nm, um
 

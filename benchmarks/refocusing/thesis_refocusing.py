@@ -32,8 +32,8 @@ import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.targets import siemens_star
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.sources import dead_leaves
 from thincam_jax.reconstruction.depth.refocus import axial_resolution
 from thincam_jax.units import nm, um
 

@@ -1,18 +1,9 @@
 import os
-import re
 
 import pytest
 
 from helpers import full_disk
 from thincam_jax._core import files
-
-
-def test_text_and_bytes_are_written(tmp_path):
-    assert files.write_whole(tmp_path / "a.txt", "π\n") == tmp_path / "a.txt"
-    assert (tmp_path / "a.txt").read_bytes() == "π\n".encode()
-    files.write_whole(str(tmp_path / "a.txt"), b"\x00\xff")
-    assert (tmp_path / "a.txt").read_bytes() == b"\x00\xff"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
 @pytest.mark.parametrize("crash", [KeyboardInterrupt, OSError])
@@ -38,15 +29,6 @@ def test_crash_while_writing_leaves_nothing_half(tmp_path):
     with full_disk(4), pytest.raises(files.WriteError, match="too large"):
         files.write_whole(path, "new text")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_missing_folder_is_told(tmp_path):
-    path = tmp_path / "absent" / "a.txt"
-    told = f"{path}: cannot be written (No such file or directory); make its folder first, or"
-    with pytest.raises(files.WriteError, match=f"^{re.escape(told)}"):
-        files.write_whole(path, "x")
-    path.parent.mkdir()  # as it was advised
-    files.write_whole(path, "x")
 
 
 def test_no_link_is_followed_and_no_neighbour_is_overwritten(tmp_path):

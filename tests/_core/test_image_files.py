@@ -15,7 +15,7 @@ import tifffile
 import thincam_jax as tc
 from thincam_jax._core import image_files
 from thincam_jax.commands.config_file import ConfigError, read_raw
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.learn.checkpoint import CheckpointError, read_description
 from thincam_jax.measured import read_image
 from thincam_jax.measured.raw import CaptureFileError
@@ -149,14 +149,6 @@ def test_whole_lossy_files_are_read(tmp_path):
     path = tmp_path / "a.tif"
     path.write_bytes(tiff(smooth, **JPEG_STRIPS))
     assert np.abs(read_image(path).pixels.astype(float) - smooth).max() < 40
-
-
-def test_small_palettes_and_bits(tmp_path):
-    """Pictures, though no captures, whose rows do not end with a byte."""
-    for mode in ("1", "P"):
-        image = PIL.Image.fromarray(GREY).convert(mode)
-        (tmp_path / "a.png").write_bytes(saved(image, "PNG", bits=1 if mode == "1" else 4))
-        assert tc.load_image(tmp_path / "a.png").shape[:2] == SHAPE
 
 
 def test_packed_images_have_a_largest_size(tmp_path, monkeypatch):

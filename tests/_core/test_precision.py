@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import quick, relative_l2
+from helpers import point_psf, quick, relative_l2
 from thincam_jax._core.precision import allow, cast, phasor
 
 SHAPE = (48, 80)
@@ -54,36 +54,14 @@ def test_double_precision_without_the_switch(model, average):
     )
 
 
-@pytest.mark.thorough
-def test_transfer_function_in_double_precision():
-    """Complex results come back in the camera's precision as well."""
-    single, double = single_camera()
-    expected = np.asarray(tc.otf(double, **conditions("float64"), pixel_integration=False))
-    with jax.enable_x64(False):
-        value = tc.otf(
-            single,
-            model=tc.PsfMethod(precision="float64"),
-            **conditions("float32"),
-            pixel_integration=False,
-        )
-        own = tc.otf(single, **conditions("float32"), pixel_integration=False)
-    assert value.dtype == own.dtype == jnp.complex64
-    error = relative_l2(np.asarray(value, complex), expected)
-    assert error < 5e-8 < relative_l2(np.asarray(own, complex), expected)
-
-
 @pytest.mark.parametrize("model", quick(MODELS[:-1], 0, 3))
 def test_single_precision_of_a_double_camera(model):
     """Comes back in float64, with the error of float32: neither none, nor more than a few 1e-5."""
-    expected = tc.psf(camera_of(), model=model, **CONDITIONS, pixel_integration=False)
-    value = tc.psf(
-        camera_of(), model=tc.PsfMethod(model, "float32"), **CONDITIONS, pixel_integration=False
-    )
+    expected = point_psf(camera_of(), model=model, **CONDITIONS)
+    value = point_psf(camera_of(), model=tc.PsfMethod(model, "float32"), **CONDITIONS)
     assert value.dtype == expected.dtype == jnp.float64
     assert 1e-8 < relative_l2(value, expected) < 3e-5
-    same = tc.psf(
-        camera_of(), model=tc.PsfMethod(model, "float64"), **CONDITIONS, pixel_integration=False
-    )
+    same = point_psf(camera_of(), model=tc.PsfMethod(model, "float64"), **CONDITIONS)
     np.testing.assert_array_equal(same, expected)
 
 
@@ -93,9 +71,7 @@ def total(single, precision):
     def of(distance):
         camera = tc.LenslessCamera(single.mask, single.sensor, distance)
         method = tc.PsfMethod(precision=precision)
-        return jnp.sum(
-            tc.psf(camera, model=method, **conditions("float32"), pixel_integration=False) ** 2
-        )
+        return jnp.sum(point_psf(camera, model=method, **conditions("float32")) ** 2)
 
     return of
 
@@ -118,7 +94,7 @@ def test_traced_numbers_with_the_switch(transform):
 
     def exact(distance):
         camera = tc.LenslessCamera(double.mask, double.sensor, distance)
-        return jnp.sum(tc.psf(camera, **given, pixel_integration=False) ** 2)
+        return jnp.sum(point_psf(camera, **given) ** 2)
 
     expected = float(transform(exact)(jnp.asarray(6.5)))
     value = transform(total(single, "float64"))(jnp.float32(6.5))
@@ -127,15 +103,6 @@ def test_traced_numbers_with_the_switch(transform):
     errors = [abs(float(v) / expected - 1) for v in (value, own)]
     assert errors[0] < 1e-6
     assert errors[0] <= errors[1]
-
-
-def test_cast_changes_floating_numbers_only():
-    tree = {"a": np.ones(2), "b": jnp.ones(2, complex), "n": np.arange(3), "f": 0.1, "s": "x"}
-    found = cast(tree, "float32")
-    assert found["a"].dtype == found["f"].dtype == np.float32
-    assert found["b"].dtype == np.complex64
-    assert found["n"].dtype == np.arange(3).dtype and found["s"] == "x"
-    assert cast({"t": True, "n": 3, "none": None}, "float32") == {"t": True, "n": 3, "none": None}
 
 
 def test_the_switch_is_put_back_after_an_error():
@@ -162,3 +129,12 @@ def test_phasor_has_all_digits_of_its_phase(dtype, largest):
     # A phase without digits has a modulus of one still; none has none.
     lost = np.abs(phasor(jnp.asarray([1e30, -3e37, np.inf, np.nan], dtype)))
     assert np.all(np.abs(lost[:2] - 1) < 0.01) and np.all(np.isnan(lost[2:]))
+
+
+def test_cast_changes_floating_numbers_only():
+    tree = {"a": np.ones(2), "b": jnp.ones(2, complex), "n": np.arange(3), "f": 0.1, "s": "x"}
+    found = cast(tree, "float32")
+    assert found["a"].dtype == found["f"].dtype == np.float32
+    assert found["b"].dtype == np.complex64
+    assert found["n"].dtype == np.arange(3).dtype and found["s"] == "x"
+    assert cast({"t": True, "n": 3, "none": None}, "float32") == {"t": True, "n": 3, "none": None}

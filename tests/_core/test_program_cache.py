@@ -7,12 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands.test_cli import call
 
 import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax._core import program_cache as cache
-from thincam_jax.commands import cli
 
 
 @pytest.fixture
@@ -57,14 +55,6 @@ def test_jax_is_told_where_and_how_much(environment):
     assert cache.cache_state() == f"{environment}, 1.0 MiB of at most 1024"
 
 
-def test_what_the_user_has_told_jax_stands(environment, monkeypatch, tmp_path):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "mine"))
-    cache.keep_programs()
-    assert "JAX_COMPILATION_CACHE_MAX_SIZE" not in os.environ
-    assert not environment.exists()
-    assert cache.cache_state() == f"{tmp_path / 'mine'}, 0.0 MiB"
-
-
 @pytest.mark.parametrize("switch", ["on", "off"])
 def test_the_first_name_that_a_script_takes_has_jax_keep_programs(environment, monkeypatch, switch):
     monkeypatch.setenv("THINCAM_CACHE", switch)
@@ -73,13 +63,6 @@ def test_the_first_name_that_a_script_takes_has_jax_keep_programs(environment, m
     monkeypatch.delitem(sys.modules, "jax")
     tc.__getattr__("units")
     assert ("JAX_COMPILATION_CACHE_DIR" in os.environ) == (switch == "on")
-
-
-def test_folder_that_cannot_be_made(environment, monkeypatch, tmp_path):
-    (tmp_path / "thincam_jax").write_text("mine", "utf-8")
-    cache.keep_programs()
-    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
-    assert cache.cache_state() == f"{environment}, not in use"
 
 
 def test_a_cache_that_another_process_holds_is_not_waited_for(environment, monkeypatch, capsys):
@@ -98,18 +81,6 @@ def test_folder_that_cannot_be_written(environment, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
     cache.keep_programs()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
-
-
-@pytest.mark.parametrize(
-    ("options", "switch", "kept"),
-    [((), "on", 1), ((), "off", 0), (("--no-cache",), "on", 0), (("--cache",), "off", 1)],
-)
-def test_switch(monkeypatch, tmp_path, options, switch, kept):
-    calls = []
-    monkeypatch.setattr(cli, "keep_programs", lambda: calls.append(1))
-    monkeypatch.setenv("THINCAM_CACHE", switch)
-    assert call(*options, "init", "study", "--out", tmp_path).exit_code == 0
-    assert len(calls) == kept
 
 
 @pytest.mark.thorough
@@ -136,3 +107,10 @@ def test_second_run_reads_what_the_first_has_compiled(tmp_path):
     second = run()
     assert second.keys() == first.keys()
     assert all(second[path] != first[path] for path in first if path != damaged)  # when read
+
+
+def test_folder_that_cannot_be_made(environment, monkeypatch, tmp_path):
+    (tmp_path / "thincam_jax").write_text("mine", "utf-8")
+    cache.keep_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    assert cache.cache_state() == f"{environment}, not in use"

@@ -1,16 +1,12 @@
 """The command: exit codes, one clear line for what a user can put right, and how to go on."""
 
 import os
-import shlex
-import shutil
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from commands.study import tiny
-from commands.sweep import mini
 from typer.testing import CliRunner
 
 from helpers import ROOT, full_disk
@@ -68,21 +64,6 @@ def test_run_prints_the_results_and_where_the_report_is(tmp_path):
     assert row in again.stdout
 
 
-@pytest.mark.thorough
-def test_the_same_file_with_another_value_gets_a_folder_of_its_own(tmp_path, monkeypatch):
-    """The two commands that the docs give, one after the other."""
-    monkeypatch.chdir(tmp_path)
-    file = mini.write(tmp_path)
-    first, second = call("run", file.name), call("run", file.name, "--set", "seed=4")
-    assert (first.exit_code, second.exit_code) == (0, 0), second.output
-    assert (
-        second.stderr == "thincam: runs/mini holds another configuration: writes to runs/mini-2\n"
-    )
-    for folder, seed in (("mini", 0), ("mini-2", 4)):
-        assert f"seed: {seed}\n" in (tmp_path / "runs" / folder / "config.yaml").read_text("utf-8")
-        assert (tmp_path / "runs" / folder / "report.html").exists()
-
-
 NOTHING = StudyScores("", 0, {}, [])
 
 
@@ -115,9 +96,6 @@ class TestExitCode2:
         assert first == "thincam: --set seed=x: seed: 'x': input should be a valid integer"
         assert second.startswith("thincam: --set mask.width=2: mask.width: 2 has no unit")
 
-    def test_markup_in_a_message_is_shown_as_it_is(self, file):
-        assert "--set seed=[red]: " in one_line(call("run", file, "--set", "seed=[red]"))
-
     def test_image_that_is_missing(self, file, tmp_path):
         out = tmp_path / "out"
         line = one_line(call("run", file, "--out", out, "--set", "targets.1.path=no.png"))
@@ -128,13 +106,6 @@ class TestExitCode2:
         file.write_text(text, encoding="utf-8")
         number = next(n for n, row in enumerate(text.split("\n"), 1) if "no.png" in row)
         assert one_line(call("run", file)).startswith(f"{file}:{number}: targets[1]: {given}")
-
-    def test_out_holds_another_study(self, file, tmp_path):
-        out = tmp_path / "out"
-        out.mkdir()
-        (out / "config.yaml").write_text("name: other\n", encoding="utf-8")
-        line = one_line(call("run", file, "--out", out))
-        assert line.startswith(f"--out {out}: holds a run of another configuration")
 
     def test_another_configuration_has_a_folder_of_its_own(self, file, tmp_path, monkeypatch):
         """Without --out the next free number is taken, and the same configuration's found again."""
@@ -306,22 +277,6 @@ def test_doctor_begins_with_a_verdict(monkeypatch):
     assert call("doctor").stdout.startswith("not ready: no-such-package is not installed\n")
 
 
-def test_help_is_in_the_order_of_use():
-    listed = call("--help").stdout.partition("Commands:")[2].splitlines()
-    assert [line.split()[0] for line in listed if line] == list(cli.ORDER)
-    text = call("reconstruct", "--help").stdout
-    titles = ("Options:", *(f"{group}:" for group in cli.GROUPS), "Examples:")
-    assert [line.strip() for line in text.splitlines() if line.strip() in titles] == list(titles)
-    assert text.index("--psf ") < text.index("Calibration:") < text.index("--dead")
-    for command in ("init", "run", "reconstruct", "sweep", "design"):
-        assert f"Examples:\n    thincam {command} " in call(command, "--help").stdout
-
-
-def test_version():
-    result = call("--version")
-    assert (result.exit_code, result.stdout) == (0, f"thincam_jax {version('thincam_jax')}\n")
-
-
 @pytest.mark.parametrize(
     ("typed", "completed"),
     [
@@ -337,26 +292,6 @@ def test_completion(typed, completed):
     given = {"_THINCAM_COMPLETE": "complete_bash", **words}
     result = runner.invoke(cli.app, [], prog_name="thincam", env=given)
     assert result.stdout.split() == completed
-
-
-@pytest.mark.parametrize("option", ["--show-completion", "--install-completion"])
-def test_completion_of_the_shell_that_asks(option, tmp_path):
-    """It is found from the process that called."""
-    bash = shutil.which("bash")
-    if bash is None:
-        pytest.skip("needs bash")
-    command = f"{shlex.quote(sys.executable)} -m thincam_jax.commands.start {option}; exit $?"
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, "PYTHONPATH": path, "HOME": str(tmp_path)}
-    done = subprocess.run(
-        [bash, "-c", command], capture_output=True, text=True, env=environment, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    script = done.stdout
-    if option == "--install-completion":
-        line = (tmp_path / ".bashrc").read_text("utf-8").strip()
-        script = Path(line.removeprefix("source ").strip("'")).read_text(encoding="utf-8")
-    assert "complete -o default -F _thincam_completion thincam" in script
 
 
 @pytest.mark.parametrize(
@@ -381,3 +316,14 @@ def test_settings_with_which_jax_cannot_start(setting, fault, file):
 def test_a_file_for_a_command_of_options_is_told_where_to_go(file, words):
     line = one_line(call(*words, file))
     assert line == f"{file}: is a study; give it to 'thincam run'"
+
+
+def test_help_is_in_the_order_of_use():
+    listed = call("--help").stdout.partition("Commands:")[2].splitlines()
+    assert [line.split()[0] for line in listed if line] == list(cli.ORDER)
+    text = call("reconstruct", "--help").stdout
+    titles = ("Options:", *(f"{group}:" for group in cli.GROUPS), "Examples:")
+    assert [line.strip() for line in text.splitlines() if line.strip() in titles] == list(titles)
+    assert text.index("--psf ") < text.index("Calibration:") < text.index("--dead")
+    for command in ("init", "run", "reconstruct", "sweep", "design"):
+        assert f"Examples:\n    thincam {command} " in call(command, "--help").stdout

@@ -18,18 +18,6 @@ class TestYaml:
         assert line.startswith(f"{second}: wavelength: this key stands twice")
         assert f"first in line {first}" in line
 
-    def test_repeated_keys_deep_inside_and_several(self, tmp_path):
-        text = changed("{beta: 21 rad/mm^2,", "{beta: 20 /mm^2, beta: 21 /mm^2,")
-        text = changed("  pitch: 40 um", "  pitch: 40 um\n  pitch: 41 um", text)
-        lines = faults(tmp_path, text)
-        assert [line.split(": ")[:2] for line in lines] == [
-            [str(line_of(text, "pitch: 41 um")), "pitch"],
-            [str(line_of(text, "{beta: 20")), "beta"],
-        ]
-
-    def test_equal_keys_in_different_sections_are_no_repetition(self, tmp_path):
-        load(tmp_path, BASE)  # width stands in mask and in object
-
     def test_anchors(self, tmp_path):
         text = changed("      - beta: 25 rad/mm^2\n", "      - &near\n        beta: 25 rad/mm^2\n")
         text = changed("{beta: 25 rad/mm^2, distance: 3 mm}", "*near", text)
@@ -81,10 +69,6 @@ class TestYaml:
             with pytest.raises(ConfigError, match="^--set seed=.*: line 1 has a number of"):
                 override({}, f"seed={given}")
 
-    def test_unit_without_a_space(self, tmp_path):
-        config = load(tmp_path, changed("pitch: 40 um", "pitch: 40um"))
-        assert config.sensor.pitch == 0.04
-
     def test_number_with_an_exponent_is_a_number(self, tmp_path):
         """PyYAML reads 1e4 as a text."""
         config = load(tmp_path, changed("full_well: 13500", "full_well: 1e4"))
@@ -133,12 +117,6 @@ class TestFile:
         with pytest.raises(ConfigError, match=r"study.yaml: not a text file in UTF-8"):
             load_experiment(path)
 
-    def test_binary(self, tmp_path):
-        path = tmp_path / "study.yaml"
-        path.write_bytes(b"name: a\x00b\n")
-        with pytest.raises(ConfigError, match="study.yaml.*not valid YAML"):
-            load_experiment(path)
-
     def test_folder(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="is a folder; give the path of a YAML"):
             load_experiment(tmp_path)
@@ -168,13 +146,6 @@ class TestOverrides:
         assert config.mask.pixel_pitch == pytest.approx(0.04)
         assert [t.name for t in config.targets] == ["only"]
 
-    def test_the_last_one_counts(self, tmp_path):
-        assert load(tmp_path, BASE, "seed=1", "seed=2").seed == 2
-
-    def test_section_that_the_file_lacks(self, tmp_path):
-        text = changed("noise:\n  snr_db: 30\n", "")
-        assert load(tmp_path, text, "noise.snr_db=20").noise.snr_db == 20
-
     @pytest.mark.parametrize(
         ("override", "field", "part"),
         [
@@ -195,18 +166,6 @@ class TestOverrides:
             place = str(line_of(BASE, "kind: wiener"))
         assert line.startswith(f"{place}: {field}: ")
         assert part in line
-
-    def test_other_faults_keep_their_place(self, tmp_path):
-        text = changed("pitch: 40 um", "pitch: 40")
-        lines = faults(tmp_path, text, "sensor.shape.0=0")
-        assert [line.split(": ")[:2] for line in lines] == [
-            ["--set sensor.shape.0=0", "sensor.shape"],
-            [str(line_of(text, "pitch: 40")), "sensor.pitch"],
-        ]
-
-    def test_an_override_repairs_the_file(self, tmp_path):
-        text = changed("pitch: 40 um", "pitch: 40")
-        assert load(tmp_path, text, "sensor.pitch=40 um").sensor.pitch == 0.04
 
     @pytest.mark.parametrize("override", ["seed", "=5", "a..b=5", ".seed=5", ""])
     def test_malformed(self, override, tmp_path):

@@ -19,7 +19,7 @@ from hardware.commands import tiny as capture
 from learn.commands.test_train_denoiser import FILE as TRAINING
 
 from helpers import ROOT
-from thincam_jax.commands.interrupt import INTERRUPTED
+from thincam_jax.commands.terminal import INTERRUPTED
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.measured.read import read_image
 

@@ -1,6 +1,5 @@
 """`thincam init`: every shipped experiment file can be had, and nothing is overwritten."""
 
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -51,12 +50,6 @@ def kind_name(path):
     return next(name for name, kind in kinds.KINDS.items() if kind is kinds.read_kind(path))
 
 
-@pytest.mark.parametrize("name", ["true", "a b", "ε: #1"])
-def test_any_file_name_is_the_name_of_its_experiment(name, tmp_path):
-    assert call("init", "study", "--out", tmp_path / f"{name}.yaml").exit_code == 0
-    assert load_experiment(tmp_path / f"{name}.yaml").name == re.sub("[:#]", "_", name)
-
-
 def test_the_page_of_commands_lists_them():
     page = (ROOT / "docs/files/commands.md").read_text("utf-8")
     table = page.split("| example | experiment |")[1].split("\n\n")[0]
@@ -100,17 +93,6 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
         "learned",
         "camera",
     ]
-
-
-def test_a_list_tells_examples_from_kinds(tmp_path):
-    """Every kind is one of them; a file that has a kind's name here keeps its own name, too."""
-    (shown,) = (
-        json.loads(line)["table"] for line in call("init", "--json").stdout.splitlines()[:1]
-    )
-    assert shown["headings"][:2] == ["example", "kind"]
-    assert {row[1] for row in shown["rows"]} == set(kinds.KINDS)
-    assert ["screen", "screen"] in [row[:2] for row in shown["rows"]]
-    assert call("init", "sts_camera", "--out", tmp_path).exit_code == 0
 
 
 def test_a_design_for_an_own_sensor(tmp_path):

@@ -161,23 +161,6 @@ def test_a_browser_shows_the_psf_of_the_camera(shown):
 
 
 @pytest.mark.thorough
-def test_two_requests_at_most_and_a_late_answer_is_not_shown(shown):
-    """Of those that wait only the newest is sent; the first answer here comes 1.5 s late."""
-    wait_until(shown, RESTS)
-    shown.evaluate("Object.assign(seen, { most: 0, all: [], late: 1 })")
-    slider = shown.locator("input[name=beta]")
-    for value in (12, *range(20, 36)):
-        slider.evaluate(MOVE, value)
-    wait_until(shown, f"seen.all.at(-1).rest && {RESTS}")
-    seen = shown.evaluate("seen")
-    last = seen["all"][-1]
-    assert seen["most"] == 2 and len(seen["all"]) <= 18 and last["rest"]
-    drawn = json.loads(shown.locator(".tc-explorer").get_attribute("data-values"))
-    assert last["values"]["beta"] == drawn["beta"] == 35
-    np.testing.assert_allclose(levels_of(shown), expected(35.0), atol=0.51)
-
-
-@pytest.mark.thorough
 def test_ctrl_c_frees_the_port(explored):
     child, port, _ = explored
     assert_ctrl_c_frees(child, port)

@@ -10,8 +10,7 @@ from commands.study import tiny
 from commands.sweep import mini
 from commands.test_cli import call, one_line
 
-from thincam_jax._core.table import Table
-from thincam_jax._core.text import escaped
+from thincam_jax._core.table import Table, escaped
 from thincam_jax.commands import terminal
 
 EVIL = "\x1b[31m\x07\u202e[/red]\x9b\r\u2028"
@@ -158,12 +157,3 @@ def test_what_a_line_advises_can_be_followed(line, wrong, advice, right, tmp_pat
     assert advice in one_line(started(wrong))
     end = started(right)
     assert end.exit_code == 0, end.output
-
-
-def test_a_log_gets_lines_where_a_bar_cannot_move(capsys):
-    with terminal.progress_bar() as bar, terminal.lines_in_a_log(bar, every=0.001):
-        bar.add_task("search", total=7, completed=2)
-        text = ""
-        while "search" not in text:
-            text += capsys.readouterr().err
-    assert "thincam: search (2 of 7), 0 s\n" in text

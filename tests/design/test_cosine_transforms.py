@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import cosine_transforms
-from thincam_jax.design.cosine_transforms import both_signs, half_places
+from thincam_jax.design import wiener
+from thincam_jax.design.wiener import both_signs, half_places
 
 COMPILED = ("fold", "transform", "waves", "series")
-fold, transform, waves, series = (jax.jit(getattr(cosine_transforms, n)) for n in COMPILED)
-unfold = jax.jit(cosine_transforms.unfold, static_argnums=1)
+fold, transform, waves, series = (jax.jit(getattr(wiener, n)) for n in COMPILED)
+unfold = jax.jit(wiener.unfold, static_argnums=1)
 SHAPES = [(6, 9), (7, 4), (1, 5)]
 
 

@@ -8,9 +8,8 @@ import pytest
 from design import small
 
 from thincam_jax.design import DesignSpace, PhotonNoise, SearchSettings, find_front, fronts
-from thincam_jax.design.fronts import FrontPoint, non_dominated
+from thincam_jax.design.fronts import non_dominated
 from thincam_jax.design.objectives import ResolutionLimit
-from thincam_jax.design.search import NonFiniteObjectiveError
 from thincam_jax.design.space import Limits
 from thincam_jax.reconstruction import phase_pairs
 
@@ -143,11 +142,3 @@ def test_near_a_place_mask_pixels_hold():
         designs = jax.vmap(near.design)(corners)
         assert np.all(designs.beta[:, 0] * designs.width <= np.pi / 0.05 * (1 + 1e-9))
         assert np.all(near.upper > near.lower)
-
-
-def test_an_objective_that_is_nan_is_refused():
-    bad = FrontPoint(np.nan, small.pairs(), np.nan, "", np.nan)
-    with pytest.raises(NonFiniteObjectiveError, match="NaN at any start"):
-        fronts._finite([bad])
-    good = FrontPoint(np.nan, small.pairs(), 1.0, "", 0.1)
-    assert fronts._finite([bad, good]) == [good]

@@ -14,6 +14,11 @@ from thincam_jax.design.objectives import ResolutionLimit, Unevenness, WorstRati
 from thincam_jax.design.space import Limits
 
 
+def waves(design, data):
+    x = (design.beta[0] - data) / 28.0
+    return 0.2 + 4 * x**2 + 0.4 * (1 - np.cos(0) * (1 - x**2))
+
+
 def test_of_two_variables():
     problem = small.problem(Bowl())
     around = landscape_around(problem, problem.space.base, count=5)
@@ -65,38 +70,11 @@ def test_over_a_width():
     assert landscape_around(free, design, count=5).variables == (("width", ()), ("beta", (1,)))
 
 
-def test_which_numbers_are_drawn():
-    base = small.pairs([25.0, 21.0, 17.0, 15.0])
-
-    def names(*variables):
-        return [v.name for v in drawn_variables(DesignSpace(base, variables))]
-
-    width, beta = small.shared("width", 1.0, 2.0, 0), small.shared("beta", 12.0, 30.0, 8)
-    one, two, three = (Variable("exposure", 0.2, 1.2, (2 * n, 2 * n + 1)) for n in range(3))
-    assert names(width, beta, one) == ["beta", "exposure"]
-    assert names(beta, one, two) == ["beta"]
-    assert names(one, two) == ["exposure", "exposure"]
-    assert names(width) == ["width"]
-    assert names(one, two, three) == []
-
-
 def made_up(objective=None, axes=2) -> Landscape:
     axis = np.linspace(12, 30, 7)
     named = tuple(("beta", (n,)) for n in range(1, axes + 1))
     costs = np.linspace(0.09, 0.4, 7**axes).reshape((7,) * axes)
     return Landscape(named, (axis,) * axes, costs, objective or BayesError())
-
-
-def test_map_reaches_to_a_design_beyond_it():
-    for reference, right in (((25.0, 21.0), 31.5), ((40.0, 21.0), 40.0)):
-        figure = made_up().plot({"a": small.pairs(reference), "b": small.pairs((20.0, 17.0))})
-        ax = figure.axes[0]
-        assert ax.get_xlim()[1] >= right
-        places = [tuple(float(c[0]) for c in line.get_data()) for line in ax.lines]
-        assert places == [reference, (20.0, 17.0)]
-        assert ax.get_xlabel() == "β of shot 1, rad/mm²"
-        assert figure.axes[1].get_ylabel() == "predicted error over the scene's variance (dB)"
-        plt.close(figure)
 
 
 @pytest.mark.parametrize("objective", [ResolutionLimit(), WorstRatio(), Unevenness()])
@@ -115,29 +93,27 @@ def test_other_objectives(objective):
     plt.close(figure)
 
 
+def test_which_numbers_are_drawn():
+    base = small.pairs([25.0, 21.0, 17.0, 15.0])
+
+    def names(*variables):
+        return [v.name for v in drawn_variables(DesignSpace(base, variables))]
+
+    width, beta = small.shared("width", 1.0, 2.0, 0), small.shared("beta", 12.0, 30.0, 8)
+    one, two, three = (Variable("exposure", 0.2, 1.2, (2 * n, 2 * n + 1)) for n in range(3))
+    assert names(width, beta, one) == ["beta", "exposure"]
+    assert names(beta, one, two) == ["beta"]
+    assert names(one, two) == ["exposure", "exposure"]
+    assert names(width) == ["width"]
+    assert names(one, two, three) == []
+
+
 def test_a_design_without_a_cost_lies_on_the_line():
     figure = dataclasses.replace(made_up(axes=1), objective=len).plot({"a": small.pairs((21.0,))})
     (point,) = figure.axes[0].lines[1].get_xydata()
     assert point == pytest.approx([21.0, 0.245])
     assert figure.axes[0].get_ylabel() == "objective to minimise"
     plt.close(figure)
-
-
-def test_axes_have_the_units_of_their_labels():
-    """Wavelengths are in nm, and all shots have the width of the first."""
-    named = (("width", ()), ("wavelength", (2,)))
-    axes = (np.linspace(1, 3, 7), np.linspace(4e-4, 6e-4, 7))
-    figure = dataclasses.replace(made_up(), variables=named, axes=axes).plot({"a": small.pairs()})
-    ax = figure.axes[0]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("mask width, mm", "wavelength of shot 2, nm")
-    assert ax.lines[0].get_xydata()[0] == pytest.approx([2.0, 500.0])
-    assert ax.get_ylim() == pytest.approx((400 - 100 / 6, 600 + 100 / 6))
-    plt.close(figure)
-
-
-def waves(design, data):
-    x = (design.beta[0] - data) / 28.0
-    return 0.2 + 4 * x**2 + 0.4 * (1 - np.cos(0) * (1 - x**2))
 
 
 def test_an_even_grid():

@@ -1,13 +1,19 @@
-"""Layouts as another program reads them, KLayout, against the masks' own samples."""
+"""Layouts and reliefs as other programs read them."""
+
+import json
 
 import klayout.db
 import numpy as np
+import PIL.Image
 import pytest
 
 import thincam_jax as tc
 from helpers import quick
+from thincam_jax._core.files import MeasurementError
+from thincam_jax.design.relief_files import read_height_map, write_height_map, write_stl
+from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.lensless.masks import random_cells
-from thincam_jax.units import um
+from thincam_jax.units import nm, um
 
 CENTRE = (0.05, -0.12)
 MASKS = {
@@ -67,15 +73,6 @@ def test_zones_are_those_of_the_cosine(tmp_path):
     np.testing.assert_array_equal(np.array(seen)[clear], (np.cos(phase) > 0)[clear])
 
 
-def test_tone_layer_and_name(tmp_path):
-    mask = MASKS["mura"]
-    shown = read(tc.design.write_gds(tmp_path / "open.gds", mask))
-    hidden = read(tc.design.write_gds(tmp_path / "dark.gds", mask, tone="opaque", layer=7), 7)
-    assert (shown & hidden).area() == 0
-    height, width = (float(side) for side in mask.extent)
-    assert (shown + hidden).area() == pytest.approx(1e12 * height * width, rel=1e-9)
-
-
 def test_what_is_too_fine_is_refused_and_the_advice_holds(tmp_path):
     path, mask = tmp_path / "mask.gds", MASKS["random"]
     with pytest.raises(ValueError, match="the mask's finest part is 20 µm wide; give a coarser"):
@@ -112,3 +109,111 @@ def test_other_masks_are_refused(mask, error, message, tmp_path):
         tc.design.write_gds(tmp_path / "mask.gds", mask)
     with pytest.raises(ValueError, match="layouts are written as .gds"):
         tc.design.write_gds(tmp_path / "mask.png", MASKS["disc"])
+
+
+HEIGHT = np.random.default_rng(0).integers(0, 4, (5, 7)) * 0.4 * um
+
+
+@pytest.mark.parametrize("material", [1.5, CauchyIndex(1.5, 4e-9), bk7()])
+@pytest.mark.parametrize("interpolation", ["cells", "bilinear"])
+def test_a_height_map_comes_back(tmp_path, material, interpolation):
+    """Counts of 8 bit hold four levels exactly; the index at another wavelength is the same."""
+    mask = tc.PhaseMask(HEIGHT, 3 * um, material, centre=(0.1, -0.2), interpolation=interpolation)
+    path = write_height_map(tmp_path / "mask.png", mask, wavelength=532 * nm)
+    with PIL.Image.open(path) as image:
+        assert image.mode == "L" and image.size == (7, 5)
+        np.testing.assert_array_equal(np.asarray(image), np.round(HEIGHT / um / 1.2 * 255))
+    told = json.loads((tmp_path / "mask.json").read_text("utf-8"))
+    assert told["wavelength_mm"] == 532e-6 and told["pitch_mm"] == 3e-3
+    np.testing.assert_allclose(told["height_per_count_mm"] * 255, 1.2e-3)
+    back = read_height_map(path)
+    np.testing.assert_allclose(back.height, HEIGHT, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(back.centre, (0.1, -0.2))
+    assert back.interpolation == interpolation
+    np.testing.assert_allclose(back.turns(620 * nm), mask.turns(620 * nm), rtol=1e-9)
+
+
+def test_what_is_no_height_map_is_told_in_one_line(tmp_path):
+    mask = tc.PhaseMask(HEIGHT, 3 * um, 1.5)
+    path = write_height_map(tmp_path / "mask.png", mask, wavelength=532 * nm)
+    record = json.loads((tmp_path / "mask.json").read_text("utf-8"))
+
+    def told(about):
+        with pytest.raises(MeasurementError, match=about) as error:
+            read_height_map(path)
+        assert "\n" not in str(error.value)
+
+    def changed(**given):
+        (tmp_path / "mask.json").write_text(json.dumps(record | given), "utf-8")
+
+    changed(height_per_count_mm=1.0)
+    told(r"mask.json: is no mask's \(height reaches from 0 to 255")
+    changed(material={"kind": "glass"})
+    told("mask.json: is no mask's")
+    changed(format="other")
+    told("mask.json: is no height map's; give one of write_height_map")
+    changed()
+    PIL.Image.new("L", (4, 4)).save(path)
+    told(r"has \(4, 4\) pixels and its JSON file says \(5, 7\)")
+    PIL.Image.new("RGB", (7, 5)).save(path)
+    told("give an 8-bit grey PNG")
+    (tmp_path / "mask.json").unlink()
+    told("mask.json: is missing")
+    with pytest.raises(ValueError, match="height maps are written as .png"):
+        write_height_map(tmp_path / "mask.tif", mask, wavelength=532 * nm)
+    grey = tc.PhaseMask(HEIGHT, 3 * um, 1.5, amplitude=np.ones((5, 7)))
+    with pytest.raises(ValueError, match="a height map holds no amplitude"):
+        write_height_map(path, grey, wavelength=532 * nm)
+
+
+def triangles_of(path):
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    assert len(data) == 84 + 50 * count
+    facet = np.dtype([("numbers", "<f4", 12), ("attribute", "<u2")])
+    numbers = np.frombuffer(data, facet, offset=84)["numbers"].reshape(count, 4, 3)
+    return numbers[:, 0], numbers[:, 1:]
+
+
+@pytest.mark.parametrize("interpolation", ["cells", "bilinear"])
+@pytest.mark.parametrize("height", [HEIGHT, np.zeros((1, 1)), np.eye(2) * um])
+def test_a_solid_is_closed_and_holds_the_sum_of_heights(tmp_path, height, interpolation):
+    """Every edge belongs to two triangles, once in each direction; normals point out.
+
+    The volume is Σh p² and the plate's: by the divergence theorem, Σ a·(b × c)/6.
+    """
+    mask = tc.PhaseMask(height, 3 * um, 1.5, interpolation=interpolation)
+    normals, triangles = triangles_of(write_stl(tmp_path / "mask.stl", mask, base=5 * um))
+    corners, index = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    index = index.reshape(-1, 3)
+    edges = np.concatenate([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
+    there, times = np.unique(edges, axis=0, return_counts=True)
+    assert (times == 1).all() and (there[:, 0] != there[:, 1]).all()
+    back = set(map(tuple, there[:, ::-1].tolist()))
+    assert back == set(map(tuple, there.tolist()))
+    assert len(corners) - len(there) / 2 + len(index) == 2  # Euler: one body without holes
+    a, b, c = np.moveaxis(triangles.astype(float), 1, 0)
+    area = height.size * (3 * um) ** 2
+    volume = height.sum() * (3 * um) ** 2 + 5 * um * area
+    np.testing.assert_allclose(np.sum(a * np.cross(b, c)) / 6, volume, rtol=1e-5)
+    assert np.isfinite(normals).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+    top = triangles[..., 2].max()
+    np.testing.assert_allclose(top, 5 * um + height.max(), rtol=1e-6)
+
+
+def test_solids_have_their_suffix_and_a_plate(tmp_path):
+    mask = tc.PhaseMask(HEIGHT, 3 * um, 1.5)
+    with pytest.raises(ValueError, match="solids are written as .stl"):
+        write_stl(tmp_path / "mask.obj", mask)
+    with pytest.raises(ValueError, match="base = 0.0 mm is not positive"):
+        write_stl(tmp_path / "mask.stl", mask, base=0.0)
+
+
+def test_down_in_the_image_is_minus_y(tmp_path):
+    """A high cell in the first row and last column stands at +x and +y."""
+    height = np.zeros((3, 4))
+    height[0, 3] = 1 * um
+    _, triangles = triangles_of(write_stl(tmp_path / "m.stl", tc.PhaseMask(height, 1 * um, 1.5)))
+    high = triangles[triangles[..., 2] > 0.1005]
+    assert (high[:, 0] > 0.9 * um).all() and (high[:, 1] > 0.4 * um).all()

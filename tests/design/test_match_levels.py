@@ -65,13 +65,6 @@ def test_slopes(model):
     assert np.all(np.isfinite(slope(point, model.levels(point))))
 
 
-@pytest.mark.thorough
-def test_order_of_captures_does_not_matter(model):
-    np.testing.assert_allclose(
-        model.levels(jnp.asarray(POINT)), model.levels(jnp.asarray(POINT[::-1])), rtol=1e-9
-    )
-
-
 def test_errors():
     with pytest.raises(ValueError, match="rings = 0; give at least 1"):
         ResponseModel(two_betas(), *DATA, 0)

@@ -13,23 +13,19 @@ from design.setting import HIGHEST, setup
 from helpers import count_traces, finite_difference
 from thincam_jax.design import BayesError, PhotonNoise, Polar, PowerLaw, SignalNoise
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.objectives import (
     Channels,
     ResolutionLimit,
-    RobustError,
-    Tolerances,
     Unevenness,
     WorstRatio,
     bayes_error,
     channels,
     limit,
     mismatch_error,
-    ring_means,
-    robust_error,
     unevenness,
     worst_ratio_db,
 )
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction import phase_pairs
 
@@ -81,25 +77,6 @@ def test_errors_of_a_filter_at_work():
         captures += np.linalg.cholesky(its_noise) @ rng.normal(size=captures.shape)
         made = np.mean((wiener @ captures - scenes) ** 2) / (np.trace(prior) / N)
         np.testing.assert_allclose(predicted, made, rtol=0.02)  # 3000·48 draws: 1 % is 3 σ
-
-
-def test_mismatch():
-    known = made_up()
-    best = float(bayes_error(known))
-    np.testing.assert_allclose(mismatch_error(known, known), best, rtol=1e-12)
-    for seed in range(1, 5):
-        actual = made_up(seed)
-        assert float(mismatch_error(known, actual)) > float(bayes_error(actual))
-
-
-def test_more_noise_is_worse():
-    known = made_up()
-    errors = [
-        float(bayes_error(replace(known, noise=known.noise * f))) for f in (0, 0.5, 1, 2, 1e9)
-    ]
-    assert errors == sorted(errors)
-    assert errors[0] < 1e-12
-    np.testing.assert_allclose(errors[-1], 1.0, atol=1e-6)
 
 
 FREQUENCIES = Polar(100.0, 640, 2)
@@ -159,13 +136,6 @@ def test_limit():
     np.testing.assert_allclose(limit(returning, FREQUENCIES), 40.0, atol=0.1)
     np.testing.assert_allclose(limit(of_ratio(lambda p: 2 + 0 * p), FREQUENCIES), 100.0)
     np.testing.assert_allclose(limit(of_ratio(lambda p: 0.5 + 0 * p), FREQUENCIES), 0.0)
-
-
-def test_ring_means_are_weighted_by_area():
-    known = of_ratio(lambda p: p)
-    edges = np.arange(9) / 8
-    means = 2 / 3 * np.diff(edges**3) / np.diff(edges**2)
-    np.testing.assert_allclose(ring_means(known, FREQUENCIES, 8), means, rtol=1e-3)
 
 
 BAND = (0.15, 0.85)
@@ -277,11 +247,6 @@ def test_gradients(noise, frequencies):
     assert counted.traces == 1
 
 
-def test_synthesis_must_fit():
-    with pytest.raises(ValueError, match=r"give \(channel, 4\), one column for each"):
-        channels(TESTED, setup(), jnp.ones((2, 3)), FREQUENCIES)
-
-
 def test_objectives_are_minimised_and_reported_in_their_sense():
     problem, band = small.problem(), (0.1, 0.6)
     data, design = problem.data, problem.space.base
@@ -311,13 +276,6 @@ def test_objectives_are_minimised_and_reported_in_their_sense():
     assert edge.label == "limit of resolution (cycles/rad)"
 
 
-@pytest.mark.thorough
-def test_tolerances_cost_something():
-    tolerances = Tolerances(beta=0.002, distance=0.03)
-    robust, problem = RobustError(tolerances), small.problem()
-    base, data = problem.space.base, problem.data
-    found = float(robust(base, data))
-    given = data.setup, data.synthesis, data.frequencies
-    assert found == pytest.approx(float(robust_error(base, *given, tolerances)), rel=1e-12)
-    assert found > 1.001 * float(BayesError()(base, data))
-    assert robust.reported(found) == pytest.approx(10 * np.log10(found))
+def test_synthesis_must_fit():
+    with pytest.raises(ValueError, match=r"give \(channel, 4\), one column for each"):
+        channels(TESTED, setup(), jnp.ones((2, 3)), FREQUENCIES)

@@ -1,15 +1,19 @@
-"""The search for the best design: known minima, regions without a number, honest counts."""
+"""The search for the best design: known minima, honest counts, ranking."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from design import small
 from design.setting import HIGHEST, error, setup, two_betas
+from design.test_sensitivity import Bowl, found_at
 
-from helpers import count_traces, in_full, quick
+from helpers import in_full, quick
 from thincam_jax.design import Polar, PowerLaw, SearchSettings, find_designs
 from thincam_jax.design.landscape import evaluate_grid
+from thincam_jax.design.objectives import bayes_error, ring_means
 from thincam_jax.design.problem import DesignProblem
+from thincam_jax.design.ranking import rank_designs, score_design
 from thincam_jax.design.search import random_search
 
 SPACE = two_betas()
@@ -47,7 +51,6 @@ def run(objective, data, seed=0, **options):
     return find_designs(problem, settings, key=jax.random.key(seed))
 
 
-SOLVERS = pytest.mark.parametrize("solver", ["bfgs", "lbfgsb"])
 ONE_SOLVER = pytest.mark.parametrize("solver", quick(["bfgs", "lbfgsb"], 0))
 
 
@@ -103,46 +106,15 @@ def test_regions_without_a_number(solver):
     """16 of 28 parts of the cube: counted among the samples, and the best is found beside them."""
     data = jnp.asarray(DEEPEST)
     result = run(holed, data, solver=solver)
-    np.testing.assert_allclose(result.found[0].values, DEEPEST, atol=0.1)
+    best = result.found[0]
+    np.testing.assert_allclose(best.values, DEEPEST, atol=0.1)
+    names = "β of shot 1, rad/mm²", "β of shot 2, rad/mm²"
+    assert best.named == dict(zip(names, np.asarray(best.values).tolist(), strict=True))
     assert abs(result.failed - 64 * 16 / 28) <= 8
     assert all(np.isfinite(f.objective) for f in result.found)
     nowhere = run(holed, data + jnp.nan, solver=solver)
     assert nowhere.found == ()
     assert nowhere.failed == 64 + 6
-
-
-@ONE_SOLVER
-def test_evaluations_are_those_made(solver):
-    """Counted from within. One start: the loop of several runs until the last has ended."""
-    COUNT[0] = 0
-    result = run(counted, jnp.asarray(DEEPEST), solver=solver, starts=1, samples=32)
-    jax.effects_barrier()
-    assert abs(result.evaluations - COUNT[0]) <= 3
-    assert 32 < result.evaluations < 32 + 60
-
-
-def test_a_key_says_all():
-    data = jnp.asarray(DEEPEST)
-    first, again, other = (run(waves, data, seed) for seed in (3, 3, 4))
-    assert [f.objective for f in first.found] == [f.objective for f in again.found]
-    np.testing.assert_array_equal(first.found[0].point, again.found[0].point)
-    assert not np.array_equal(first.found[0].point, other.found[0].point)
-
-
-@pytest.mark.thorough
-@SOLVERS
-def test_other_values_do_not_compile_again(solver):
-    traced = count_traces(waves)
-    run(traced, jnp.asarray(DEEPEST), solver=solver)
-    before = traced.traces
-    result = run(traced, jnp.asarray([20.0, 11.0]), 7, solver=solver)
-    assert traced.traces == before > 0
-    np.testing.assert_allclose(result.found[0].values, [20.0, 11.0], atol=0.1)
-
-
-def test_exhausted_is_told():
-    result = run(waves, jnp.asarray(DEEPEST), steps=2)
-    assert {f.status for f in result.found} == {"iterations_exhausted"}
 
 
 def test_scale_does_not_matter():
@@ -188,3 +160,37 @@ def test_random_designs_cost_as_much_as_the_search():
     exact = value(best, DEEPEST + 1.0)
     np.testing.assert_allclose(design.beta[jnp.asarray([0, 2])], best[np.argmin(exact)])
     assert search.found[0].objective < min(exact)
+
+
+def test_ranked_by_the_exact_value_and_orders_of_shots_are_one():
+    problem = small.problem(Bowl())
+    betas = [(20.0, 15.0), (15.1, 19.9), (18.0, 15.0), (24.0, 15.0)]
+    ranked = rank_designs(problem, tuple(found_at(problem, *b) for b in betas))
+    # Exactly: 4 + 4.8, 8 + 1.2, 20 + 19.2; 15.1, 19.9 is the first with its shots exchanged.
+    assert [[s.beta for s in one.shots] for one in ranked] == [
+        *(pytest.approx(b) for b in ((20, 15), (18, 15), (24, 15)))
+    ]
+    assert [one.exact for one in ranked] == pytest.approx([8.8, 9.2, 39.2])
+    assert [one.searched for one in ranked] == pytest.approx([4, 8, 20])
+    assert [one.name for one in ranked] == ["found 1", "found 2", "found 3"]
+    assert ranked[0].active == ("a",)
+    np.testing.assert_allclose(ranked[0].design.beta, [20, 20, 15, 15])
+    assert ranked[0].values[1].tolerance == pytest.approx(np.sqrt(0.044))
+    given = found_at(problem, 18.0, 15.0), found_at(problem, 20.0, 15.0)
+    assert rank_designs(problem, given)[0].shots[0].beta == pytest.approx(20)
+
+
+@jax.jit
+def compiled_channels(data):
+    return data.channels(small.pairs())
+
+
+@pytest.mark.thorough
+def test_score_of_a_design():
+    problem = small.problem()
+    scored = score_design(problem, problem.space.base, "pairs")
+    assert scored.name == "pairs" and scored.level.shape == (64,)
+    known, other = map(compiled_channels, (problem.exact, problem.data))
+    np.testing.assert_allclose(scored.level, ring_means(known, problem.exact.frequencies, 64))
+    assert scored.exact == pytest.approx(float(bayes_error(known)))
+    assert scored.searched == pytest.approx(float(bayes_error(other)))

@@ -8,9 +8,9 @@ import pytest
 from design import small
 
 from thincam_jax.design import BayesError, DesignSpace, sensitivity_around
-from thincam_jax.design.frequencies import Quadrant
 from thincam_jax.design.search import Found
 from thincam_jax.design.sensitivity import least_change, uncoupled
+from thincam_jax.design.setup import Quadrant
 from thincam_jax.design.space import Limits
 
 

@@ -1,4 +1,4 @@
-"""What of a design is free: limits are kept at every point, and refused with their names."""
+"""Free numbers of a design within their limits, and the design for an own sensor."""
 
 import math
 
@@ -6,45 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from design.setting import thesis_design, two_betas
+from design.setting import thesis_design
 
-from helpers import count_traces
+import thincam_jax as tc
 from thincam_jax.design import DesignSpace, Variable, shots
 from thincam_jax.design.design import Design
+from thincam_jax.design.landscape import evaluate_grid
+from thincam_jax.design.own_sensor import beta_bounds
+from thincam_jax.design.search import evaluate
 from thincam_jax.design.space import Limits, active_limits
 from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.units import um
 
 BASE = thesis_design()
 BETA = Variable("beta", 8.0, 36.0, (0, 1))
 LENGTH = Variable("distance", 2.0, 9.0, (0, 1, 2, 3))
 WIDE = Variable("width", 3.0, 8.0)
-
-
-def test_a_design_on_its_limit_may_be_the_base_of_another_space():
-    """In single precision 6.3 mm is a rounding above itself."""
-    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), BASE)
-    on_limit = shots(
-        jnp.asarray([25.0, 21.0], jnp.float32),
-        jnp.asarray(6.3, jnp.float32),
-        (0.0, 1.5),
-        wavelength=5e-4,
-        width=5.6,
-    )
-    assert float(jnp.asarray(6.3, jnp.float32)) > 6.3
-    assert DesignSpace(on_limit, (BETA,), Limits(thickness=6.3)).size == 1
-    with pytest.raises(ValueError, match="conflicts with a thickness"):
-        DesignSpace(single, (BETA,), Limits(thickness=6.3))
-
-
-def test_corners():
-    space = DesignSpace(BASE, (BETA, LENGTH), Limits(thickness=7.0))
-    low, high = space.design(jnp.zeros(2)), space.design(jnp.ones(2))
-    np.testing.assert_allclose(low.beta, [8, 8, 21, 21])
-    np.testing.assert_allclose(low.distance, 2.0)
-    np.testing.assert_allclose(high.beta, [36, 36, 21, 21])
-    np.testing.assert_allclose(high.distance, 7.0)
-    np.testing.assert_array_equal(high.phase, BASE.phase)
-    assert space.size == 2
 
 
 def test_mask_pixels_hold_for_every_width():
@@ -106,33 +83,6 @@ def test_captures_share_an_exposure():
     np.testing.assert_allclose(kept.exposure, [0.5, 0.5, 0.5, 1.5])
 
 
-def test_mapped_and_compiled_once():
-    space = two_betas()
-    counted = count_traces(lambda space, points: jax.vmap(space.design)(points))
-    compiled = jax.jit(counted)
-    points = jnp.asarray([[0.0, 1.0], [0.5, 0.25], [1.0, 0.0]])
-    designs = compiled(space, points)
-    np.testing.assert_allclose(designs.beta[1], [22, 22, 15, 15])
-    assert designs.width.shape == (3,)
-    base = shots([24.0, 20.0], 6.0, (0.0, 1.0), wavelength=510e-6, width=5.0)
-    compiled(DesignSpace(base, space.variables), points)
-    assert counted.traces == 1
-
-
-def test_active_limits_in_words():
-    space = DesignSpace(BASE, (BETA, LENGTH, Variable("phase", -1.0, 1.0, (3,))), Limits(0.02, 7.0))
-    words = active_limits(space, jnp.asarray([1.0, 0.9999, 0.0]))
-    assert words == (
-        "beta of capture 1, 2 ≤ 27.8906 rad/mm^2 (mask pixels of 0.02 mm)",
-        "distance of capture 1, 2, 3, 4 ≤ 6.9995 mm (thickness of 7 mm)",
-        "phase of capture 4 ≥ -1 rad",
-    )
-    assert active_limits(space, jnp.full(3, 0.5)) == ()
-    assert active_limits(DesignSpace(BASE, (BETA,)), jnp.ones(1)) == (
-        "beta of capture 1, 2 ≤ 36 rad/mm^2",
-    )
-
-
 @pytest.mark.parametrize(
     ("variables", "limits", "message"),
     [
@@ -182,5 +132,54 @@ def test_refused(variables, limits, message):
         DesignSpace(BASE, variables, limits)
 
 
-def test_captures_may_come_as_an_array():
-    assert Variable("beta", 8.0, 9.0, np.array([0, 1])).captures == (0, 1)
+def test_bounds_are_two_zones_and_two_pixels_a_period():
+    low, high = beta_bounds(0.00345, 5.175)
+    assert low * 5.175**2 / 4 == pytest.approx(2 * 2 * np.pi)
+    assert high * (5.175 / 2) / np.pi == pytest.approx(1 / (2 * 0.00345))  # cycles/mm at the edge
+    few = beta_bounds(0.1, 0.8)
+    assert 0 < few[0] < few[1]
+
+
+@pytest.mark.parametrize("given", [(10.0, 3.0), (0.0, 3.0), (3.0, float("inf"))])
+def test_distances_that_cross_are_refused(given):
+    with pytest.raises(ValueError, match=r"give the least and the most in mm, such as \(3, 10\)"):
+        tc.design.for_sensor(tc.Sensor((12, 16), 100 * um), distance=given)
+
+
+@pytest.mark.thorough
+def test_no_worse_than_an_exhaustive_grid():
+    found = tc.design.for_sensor(tc.Sensor((60, 80), 40 * um), distance=(3.0, 6.0))
+    problem, best = found.problem, found.best
+    with jax.enable_x64(True):
+        points, costs = evaluate_grid(problem.objective, problem.space, problem.data, 17)
+        lowest = points[np.argsort(costs)[:8]]
+        numbers = problem.objective, problem.space, problem.exact
+        exact = np.asarray(evaluate(*numbers, lowest, at_a_time=1))
+        assert best.objective < 1.001 * exact.min()
+        for n, (low, high) in enumerate(found.plateaus):
+            assert low <= best.values[n] <= high
+            lower, upper = problem.space.lower[n], problem.space.upper[n]
+            ends = (jnp.array([low, high]) - lower) / (upper - lower)
+            inside = jnp.tile(best.point, (2, 1)).at[:, n].set(ends)
+            worse = 10 * np.log10(np.asarray(evaluate(*numbers, inside, at_a_time=1)))
+            assert np.all(worse - found.errors_db[0] <= 0.1 + 1e-6)
+    own, usual, random = found.errors_db
+    assert own <= min(usual, random)
+    assert found.evaluations < 1600
+    text = str(found)
+    assert "β of shot 1, rad/mm²" in text and "the thesis' pair" in text
+    assert text.count("is within 0.1 dB") == 3
+
+
+def test_active_limits_in_words():
+    space = DesignSpace(BASE, (BETA, LENGTH, Variable("phase", -1.0, 1.0, (3,))), Limits(0.02, 7.0))
+    words = active_limits(space, jnp.asarray([1.0, 0.9999, 0.0]))
+    assert words == (
+        "beta of capture 1, 2 ≤ 27.8906 rad/mm^2 (mask pixels of 0.02 mm)",
+        "distance of capture 1, 2, 3, 4 ≤ 6.9995 mm (thickness of 7 mm)",
+        "phase of capture 4 ≥ -1 rad",
+    )
+    assert active_limits(space, jnp.full(3, 0.5)) == ()
+    assert active_limits(DesignSpace(BASE, (BETA,)), jnp.ones(1)) == (
+        "beta of capture 1, 2 ≤ 36 rad/mm^2",
+    )

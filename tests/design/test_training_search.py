@@ -10,7 +10,6 @@ from design import small
 
 from thincam_jax.design import DesignSpace
 from thincam_jax.design.problem import DesignProblem
-from thincam_jax.design.ranking import rank_trained
 from thincam_jax.design.search import NonFiniteObjectiveError, evaluate
 from thincam_jax.design.space import Limits
 from thincam_jax.design.training_search import (
@@ -20,10 +19,8 @@ from thincam_jax.design.training_search import (
     base_point,
     build_training,
     start_points,
-    train_designs,
     training_pixels,
 )
-from thincam_jax.design.wiener import wiener_error
 from thincam_jax.imaging.targets import sample_image
 from thincam_jax.reconstruction import phase_pairs
 
@@ -75,13 +72,6 @@ def test_descents_begin_at_the_best_points_apart(problem):
     assert {bool(b > 21) for b in betas[:, 0]} == {True, False}  # a start in either basin
 
 
-def test_the_base_and_designs_of_the_search_can_be_starts(problem):
-    starts, count = starts_of(problem.space, TrainingSettings(samples=1, starts=10), [0.18, 0.16])
-    assert count == 3 >= len(starts)  # the sample may meet NaN
-    assert np.asarray(starts[0]) == pytest.approx([0.18, 0.16])
-    assert any(np.allclose(problem.space.values(p), [25.0, 21.0]) for p in starts)
-
-
 def test_the_base_lies_in_the_cube():
     """With a free width, too, where the widest mask leaves β no room."""
 
@@ -131,22 +121,6 @@ def test_descents_end_lower_than_they_began(problem):
     for one in trained.found:
         assert np.all(np.asarray(one.values) >= np.asarray(problem.space.lower))
         assert np.all(np.asarray(one.values) <= np.asarray(problem.space.upper))
-
-
-@pytest.mark.thorough
-def test_trained_designs_are_ranked_by_their_error(problem):
-    trained = train_designs(problem, [np.array([0.5, 0.4])], SETTINGS, key=KEY)
-    error = jax.jit(wiener_error)
-    assert trained.reference == pytest.approx(float(error(problem.space.base, problem.data)))
-    assert trained.landscape is not None and trained.landscape.costs.shape == (5, 5)
-    chosen = small.pairs([trained.landscape.axes[0][1], trained.landscape.axes[1][3]])
-    expected = float(error(chosen, problem.data))
-    assert trained.landscape.costs[1, 3] == pytest.approx(expected, rel=1e-6)
-    ranked = rank_trained(small.problem(), trained)
-    errors = [one.trained for one in ranked]
-    assert errors == sorted(errors)
-    for one in ranked:
-        assert [v.value for v in one.values] == pytest.approx([s.beta for s in one.shots])
 
 
 def test_an_error_that_is_nan_is_refused(problem):

@@ -98,18 +98,6 @@ def synthesised(chosen, given):
 
 
 @pytest.mark.thorough
-def test_restored_are_nearly_those_of_the_wiener_synthesis_at_two_distances():
-    """With little noise: on so few pixels estimates of the scene's strength differ otherwise."""
-    given, chosen = training(SignalNoise(45.0)), design(distance=(5.0, 7.0))
-    images = np.asarray(given.images)
-    found, expected = np.asarray(compiled(chosen, given)[0]), synthesised(chosen, given)
-    error = [np.mean((r - images) ** 2) / np.var(images) for r in (found, expected)]
-    assert error[1] < 0.1
-    assert error[0] == pytest.approx(error[1], rel=0.08)
-    assert np.mean((found - expected) ** 2) < 0.08 * np.mean((expected - images) ** 2)
-
-
-@pytest.mark.thorough
 def test_restored_are_those_of_the_wiener_synthesis():
     given, chosen = training(), design()
     restored, error_of_all = compiled(chosen, given)
@@ -155,22 +143,6 @@ def test_coarse_pixels_carry_the_noise_of_the_fine_ones():
     assert error[0] == pytest.approx(error[1], rel=1e-9)
     noisier = training(SignalNoise(0.0), pitch=0.08, **small)
     assert float(compiled(design(), noisier)[1]) > error[1]
-
-
-@pytest.mark.thorough
-def test_a_capture_with_its_bias_is_restored():
-    single = training(synthesis=np.eye(4)[:1], count=12, sensor=(20, 24))
-    assert 0 < float(compiled(design(), single)[1]) < 1
-
-
-@pytest.mark.thorough
-def test_new_values_are_not_traced_again():
-    small = {"count": 12, "sensor": (20, 24)}
-    compiled(design(), training(**small))
-    before = restored_and_error.traces
-    assert before > 0
-    compiled(design((21.0, 8.0), (5.5, 6.5)), training(SignalNoise(20.0), **small))
-    assert restored_and_error.traces == before
 
 
 def test_errors():

@@ -15,18 +15,20 @@ import numpy as np
 from thincam_jax.hardware import Camera, CameraSettings, Display, Stage
 from thincam_jax.hardware.acquisition.plan import BLACK, AcquisitionPlan, AcquisitionStep, Pattern
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.base import Frame, Identity, Region
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Busy,
     Disconnected,
+    Frame,
+    Identity,
     IncompleteFrame,
     NotFound,
     OutOfRange,
     ProtocolError,
+    Region,
     Timeout,
 )
 from thincam_jax.hardware.plans import pictures, scene
-from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.devices import Faults
 
 SHAPE = (6, 9)  # of sensor and display
 BITS = 12

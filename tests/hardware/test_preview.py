@@ -26,27 +26,6 @@ def shown(view, name="frame"):
     return np.asarray(PIL.Image.open(io.BytesIO(view.pictures[name])), float)
 
 
-def test_controls_set_the_devices_and_only_when_they_are_turned(world):
-    with world.rig() as rig:
-        world.position = 7.5
-        preview = Preview(rig, fiducial_plan(3))
-        assert [one.name for one in preview.controls] == [
-            *("exposure", "gain", "pattern", "position")
-        ]
-        assert preview.view().values["exposure"] == pytest.approx(1000 * SETTINGS.exposure)
-        assert world.position == 7.5  # looking does not move the stage
-        preview.turn({"exposure": 20.0, "pattern": 2.0, "position": 12.0})
-        view = preview.view()
-        assert rig.camera.settings.exposure == pytest.approx(0.02)
-        assert (world.position, world.shown[0, 0]) == (12.0, 3)
-        header, pictures = view.message()
-        assert json.loads(header)["values"]["position"] == 12.0 and len(pictures) == 1
-        with pytest.raises(ValueError, match="control"):
-            preview.turn({"focus": 1.0})
-        with pytest.raises(ValueError, match="exposure"):
-            preview.turn({"exposure": 1e6})
-
-
 def test_a_frame_is_shown_on_its_scale_with_full_pixels_in_red(world):
     with world.rig(stage=False) as rig:
         preview = Preview(rig, fiducial_plan(1, stage=False), image=lambda frame: frame / 4095)
@@ -126,3 +105,24 @@ def test_a_device_that_fails_is_told_of_and_used_again(world, fault, role):
         assert line.startswith(f"{role}: ")
         assert "frame" in preview.view().pictures
         assert world.opened[role] == (2 if fault == "unplug" else 1)
+
+
+def test_controls_set_the_devices_and_only_when_they_are_turned(world):
+    with world.rig() as rig:
+        world.position = 7.5
+        preview = Preview(rig, fiducial_plan(3))
+        assert [one.name for one in preview.controls] == [
+            *("exposure", "gain", "pattern", "position")
+        ]
+        assert preview.view().values["exposure"] == pytest.approx(1000 * SETTINGS.exposure)
+        assert world.position == 7.5  # looking does not move the stage
+        preview.turn({"exposure": 20.0, "pattern": 2.0, "position": 12.0})
+        view = preview.view()
+        assert rig.camera.settings.exposure == pytest.approx(0.02)
+        assert (world.position, world.shown[0, 0]) == (12.0, 3)
+        header, pictures = view.message()
+        assert json.loads(header)["values"]["position"] == 12.0 and len(pictures) == 1
+        with pytest.raises(ValueError, match="control"):
+            preview.turn({"focus": 1.0})
+        with pytest.raises(ValueError, match="exposure"):
+            preview.turn({"exposure": 1e6})

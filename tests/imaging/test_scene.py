@@ -102,18 +102,6 @@ def test_a_pinhole_turns_the_image_by_180_degrees():
     np.testing.assert_allclose(halved, np.kron(image[::-1, ::-1], np.ones((2, 2))), rtol=1e-12)
 
 
-def test_outside_the_image_it_is_dark():
-    sampled = ImagePlane(np.ones((2, 4)), 100.0, 0.4).sample(Grid((5, 8), 0.1))
-    expected = np.zeros((5, 8))
-    expected[1:4, 2:6] = np.array([0.5, 1.0, 0.5])[:, None]  # 2 rows over 5: half cells
-    np.testing.assert_allclose(sampled, expected, atol=1e-14)
-
-
-def test_height_follows_from_square_pixels():
-    assert ImagePlane(np.ones((3, 30, 40)), 250.0, 180.0).height == pytest.approx(135.0)
-    assert ImagePlane(np.ones((50, 40)), 250.0, 180.0).height == pytest.approx(225.0)
-
-
 def test_the_scale_is_differentiable():
     """Averages are piecewise quadratic in the scale; the step stays within one piece."""
     image, weights, grid = picture((5, 8)), picture((6, 7), seed=1), Grid((6, 7), 0.13)
@@ -128,11 +116,6 @@ def test_the_scale_is_differentiable():
         direction = tuple(jnp.asarray(float(i == argument)) for i in (0, 1))
         expected = finite_difference(lambda x: both(*x)[0], at, direction, 1e-4)
         np.testing.assert_allclose(slope, expected, rtol=1e-8)
-
-
-def test_whole_numbers_become_radiances():
-    plane = ImagePlane(np.array([[0, 255], [3, 4]]), 10.0, 1.0)
-    assert jnp.issubdtype(plane.image.dtype, jnp.floating) and plane.image[0, 1] == 255.0
 
 
 def test_a_photograph_is_taken_as_it_is():
@@ -174,19 +157,13 @@ def test_impossible_spectra(arguments, message):
         Spectrum(*arguments)
 
 
-def test_scenes_take_one_plane_or_several():
-    plane = ImagePlane(picture((2, 3, 4)), 10.0, 1.0)
-    scene = Scene(plane, 500 * nm)
-    assert scene.planes == (plane,) and float(scene.spectrum.wavelengths[0]) == 500 * nm
-    assert len(Scene([plane, plane], Spectrum(500 * nm)).planes) == 2
-
-
 def test_a_wavelength_is_light_of_one_colour():
     plane = ImagePlane(picture((3, 4)), 10.0, 1.0)
     guessed = Scene(plane, wavelength=530 * nm)
     assert eqx.tree_equal(guessed, Scene(plane, Spectrum(530 * nm)), Scene(plane, 530 * nm))
-    for light in ({}, {"spectrum": Spectrum(530 * nm), "wavelength": 530 * nm}):
-        with pytest.raises(TypeError, match=r"^give the light of a Scene once: a Spectrum, or .*$"):
+    both = {"spectrum": Spectrum(530 * nm), "wavelength": 530 * nm}
+    for light, fault in (({}, "is missing"), (both, "is given twice")):
+        with pytest.raises(TypeError, match=rf"^the light of the Scene {fault}; give wavelength="):
             Scene(plane, **light)
 
 

@@ -100,20 +100,6 @@ def test_quantisation():
     assert 0.4 * 1.25 / 4095 < error <= 0.5001 * 1.25 / 4095
 
 
-def test_the_key_decides(key):
-    image, sensor, noise = ramp(), tc.Sensor((200, 301), 0.01), tc.GaussianNoise(20.0)
-    first, again = (read_out(sensor, image, noise=noise, key=key) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    other = read_out(sensor, image, noise=noise, key=jax.random.fold_in(key, 1))
-    assert np.abs(first - other).min() > 0 or np.abs(first - other).mean() > 0.01
-
-
-def test_black_image_stays_black(key):
-    sensor = tc.Sensor((2, 3), 0.01, exposure=0.9, bit_depth=8)
-    value = read_out(sensor, jnp.zeros((2, 3)), noise=tc.GaussianNoise(20.0), key=key)
-    np.testing.assert_array_equal(value, 0.0)
-
-
 def test_differentiable_through_the_noise(key):
     """d/ds of s·image + σ(s)·n is image + σ n: the noise of a fixed key scales with the image."""
     image, sensor = ramp((5, 7)), tc.Sensor((5, 7), 0.01)
@@ -153,11 +139,3 @@ def test_refusals(build, message):
 def test_a_pitch_in_micrometres_is_refused():
     with pytest.raises(ValueError, match=r"pitch = 5.5 mm is no pixel: .*5.5 \* um"):
         tc.Sensor((3, 4), 5.5)
-
-
-def test_a_seed_is_a_key():
-    sensor, noise = tc.Sensor((3, 4), 0.1), tc.GaussianNoise(30.0)
-    noisy = [read_out(sensor, jnp.ones((3, 4)), noise=noise, key=k) for k in (7, jax.random.key(7))]
-    np.testing.assert_array_equal(*noisy)
-    with pytest.raises(TypeError, match=r"key is -1; give a seed, 0 or more, or jax.random.key"):
-        read_out(sensor, jnp.ones((3, 4)), noise=noise, key=-1)

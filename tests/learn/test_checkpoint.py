@@ -150,25 +150,11 @@ def test_counts_are_checked_before_anything_is_read(what, file):
         read_description(forged(file, FORGED[what]))
 
 
-def test_a_newer_format_says_so(file):
-    forged(file, lambda header: header.update(version=checkpoint.VERSION + 1))
-    with pytest.raises(CheckpointError, match=r"has format 2 .* reads 1; update thincam_jax"):
-        read_description(file)
-
-
 @pytest.mark.parametrize("text", ["", "[" * 100_000, '{"format": "other"}', "null", "7", "\xff"])
 def test_what_is_no_such_file_is_told(text, tmp_path):
     (tmp_path / "other").write_bytes(text.encode("latin-1") + b"\n")
     with pytest.raises(CheckpointError, match="is no file of a network"):
         read_description(tmp_path / "other")
-
-
-def test_arrays_of_another_model_are_told(file):
-    with pytest.raises(CheckpointError, match=r"other arrays \(2\) than are wanted here \(1\)"):
-        read_arrays(file, {"weight": TREE["weight"]})
-    other = {**TREE, "weight": jnp.zeros((2, 4))}
-    with pytest.raises(CheckpointError, match=re.escape("['weight'] is float64[2, 3] and the")):
-        read_arrays(file, other)
 
 
 def test_the_first_difference_of_two_descriptions_is_named():
@@ -177,3 +163,17 @@ def test_the_first_difference_of_two_descriptions_is_named():
     assert difference(KNOWN, here) == "whose camera.beta was 13.0 and is 20.0 here"
     here["camera"] = {"beta": 13.0 * (1 + 1e-8), "shape": [4, 7]}
     assert difference(KNOWN, here) == "whose camera.shape.1 was 6 and is 7 here"
+
+
+def test_a_newer_format_says_so(file):
+    forged(file, lambda header: header.update(version=checkpoint.VERSION + 1))
+    with pytest.raises(CheckpointError, match=r"has format 2 .* reads 1; update thincam_jax"):
+        read_description(file)
+
+
+def test_arrays_of_another_model_are_told(file):
+    with pytest.raises(CheckpointError, match=r"other arrays \(2\) than are wanted here \(1\)"):
+        read_arrays(file, {"weight": TREE["weight"]})
+    other = {**TREE, "weight": jnp.zeros((2, 4))}
+    with pytest.raises(CheckpointError, match=re.escape("['weight'] is float64[2, 3] and the")):
+        read_arrays(file, other)

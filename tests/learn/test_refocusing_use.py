@@ -17,15 +17,12 @@ import thincam_jax as tc
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.learn.checkpoint import CheckpointError, network_description, write_arrays
 from thincam_jax.learn.commands.refocusing import LearnedConfig, build_camera
-from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
-from thincam_jax.learn.refocusing.sources import as_json, drawn
+from thincam_jax.learn.refocusing.network import RefocusNetwork
+from thincam_jax.learn.refocusing.sources import as_json, dead_leaves
 from thincam_jax.learn.refocusing.store import KIND, SHIPPED, SHIPPED_FILE
-from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
+from thincam_jax.learn.refocusing.train import NETWORK, STATE, train
 from thincam_jax.learn.refocusing.use import Learned, doubt
-from thincam_jax.learn.training import TrainingOptions
-from thincam_jax.units import nm, um
+from thincam_jax.units import nm
 
 
 @pytest.fixture(scope="module")
@@ -108,28 +105,6 @@ def recording(distance: object = 80.0, **more):
     return tc.Recording([capture], cameras, noise_variance=1e-4, **more)
 
 
-@pytest.mark.thorough
-def test_it_is_a_solver():
-    network = tiny.network()
-    found = tc.reconstruct(recording(), Learned(network))
-    assert found.method == "learned" and found.status == "ok"
-    assert found.image.shape == found.confidence.shape == (14, 12)
-    assert float(found.pitch) == pytest.approx(0.044 * 80 / 7.5)
-    assert found.consistency.shape == ()
-    sharp = tc.reconstruct(recording(None), Learned(network, "all_in_focus"))
-    assert sharp.image.shape == (14, 12) and sharp.pitch is None
-
-
-@pytest.mark.thorough
-def test_several_distances_are_planes_and_all_is_as_the_network_says():
-    network, capture = tiny.network(), recording().captures[0]
-    planes = tc.reconstruct(recording([80.0, 150.0]), Learned(network))
-    assert planes.has_planes and planes.image.shape == (2, 14, 12)
-    image = network.focus(capture, 80.0, 1e-2)
-    np.testing.assert_allclose(planes.image[0], image[::-1, ::-1], rtol=1e-5, atol=1e-7)
-    assert float(planes.consistency) == pytest.approx(float(network.consistency(capture, 1e-2)))
-
-
 def test_what_it_cannot_do_is_told_in_a_line():
     network = tiny.network()
     for distance in (49.0, [80.0, 201.0]):
@@ -149,20 +124,6 @@ def test_what_it_cannot_do_is_told_in_a_line():
 
 def test_what_does_not_explain_its_capture_is_doubted():
     assert doubt(1.1) == "" and "misses the capture by 3.0 times the noise" in doubt(3.0)
-
-
-@pytest.mark.thorough
-def test_a_short_training_beats_the_linear_start():
-    """32×32 pixels, in under a minute on two cores."""
-    aperture = tc.FresnelZoneAperture(13.0, width=1.4)
-    camera = tc.LenslessCamera(aperture, tc.Sensor((32, 32), 44 * um), 7.5)
-    whole = RefocusCamera(camera, 500 * nm, field_shape=(24, 24), near=50.0, far=200.0, planes=3)
-    options = NetworkOptions(steps=2, widths=(8, 12))
-    network = RefocusNetwork.create(whole, options, key=jax.random.key(1))
-    training = TrainingOptions(steps=200, rate=4e-3, warm_up=10, check_every=50)
-    state = train(network, Lessons(drawn(0, 32, 48), batch=4, pool=32, judged=2), training).state
-    # 0.115 is 1 dB.
-    assert state.scores[-1] < state.scores[0] - 0.03 and np.isfinite(state.losses).all()
 
 
 def test_what_is_shipped_may_be_given_on():

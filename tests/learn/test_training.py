@@ -1,4 +1,4 @@
-"""Training in general: it learns, survives NaN, and goes on to the same bits."""
+"""Training: it learns, survives NaN, goes on to the same bits; and a learned τ."""
 
 import dataclasses
 import os
@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reconstruction.test_choose_tau import posed, solved
 
 from helpers import ROOT
+from thincam_jax.learn import learn_tau
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.training import (
     Task,
@@ -24,6 +26,7 @@ from thincam_jax.learn.training import (
     train_model,
     write_state,
 )
+from thincam_jax.reconstruction.problem import with_tau
 
 OPTIONS = TrainingOptions(steps=40, rate=0.1, warm_up=5, check_every=10, averaging=0.8)
 
@@ -69,11 +72,6 @@ def test_it_learns_and_tells_how_it_goes():
     assert [progress.step for progress in told] == list(range(1, 41))
     assert told[-1].seconds_left == 0 < told[5].seconds_left
     assert told[0].parts == {"error": told[0].loss}
-
-
-def test_a_callback_stops_it():
-    trained = train_model(TASK, MODEL, OPTIONS, callback=lambda progress: progress.step == 15)
-    assert trained.status == "stopped" and trained.state.step == 15
 
 
 def test_states_go_through_files_and_go_on_to_the_same_bits(tmp_path):
@@ -178,3 +176,29 @@ def test_a_process_killed_at_twenty_moments_goes_on_to_the_same_bits(tmp_path):
             tmp_path / f"state-{number}", moments.randrange(4), moments.uniform(0, 0.08)
         )
         assert eqx.tree_equal(found, whole)
+
+
+@pytest.mark.thorough
+def test_learning_finds_the_least_error_of_known_images():
+    pairs = [posed(seed, tau=0.3) for seed in (0, 1)]
+    problems, truths = zip(*pairs, strict=True)
+    factor, course = learn_tau(problems, truths, steps=12, iterations=200)
+
+    def error(factor):
+        images = [solved(with_tau(p, p.tau * factor)) for p in problems]
+        pairs = zip(images, truths, strict=True)
+        return np.mean([float(jnp.mean((image - truth) ** 2)) for image, truth in pairs])
+
+    assert course[0] == pytest.approx(error(1.0), rel=1e-3)
+    assert course[-1] < 0.95 * course[0]
+    assert error(float(factor)) < 1.02 * min(error(f) for f in np.geomspace(0.5, 20, 9))
+
+
+def test_a_callback_stops_it():
+    trained = train_model(TASK, MODEL, OPTIONS, callback=lambda progress: progress.step == 15)
+    assert trained.status == "stopped" and trained.state.step == 15
+
+
+def test_what_cannot_be_learned_from_is_refused():
+    with pytest.raises(ValueError, match="0 problems, 1 images; give one for each"):
+        learn_tau([], [jnp.zeros((1, 1, 3, 4))])

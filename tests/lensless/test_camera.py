@@ -1,5 +1,6 @@
-"""The lensless camera: its distance, the way of the light through it, its gradients."""
+"""The lensless camera, its gradients, and its exposures."""
 
+import math
 from dataclasses import replace
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax._core.precision import cast
+from helpers import finite_difference
 from thincam_jax.units import nm, um
 
 MASK = tc.FresnelZoneAperture(25.0, width=5.632)
@@ -30,19 +31,6 @@ def test_path_of_the_thesis_camera():
     assert float(camera().path(500 * nm, jnp.inf).magnification) == 1.0
 
 
-def test_a_camera_is_a_tree_of_its_numbers():
-    """β, φ, width, distance and pitch are leaves, so that gradients reach them through jit."""
-
-    @jax.jit
-    def shadow_width(camera):
-        return camera.mask.width * camera.path(500 * nm, 250.0).magnification
-
-    slopes = jax.grad(shadow_width)(camera())
-    assert float(slopes.mask.width) == pytest.approx(1.026)
-    assert float(slopes.distance) == pytest.approx(5.632 / 250)
-    assert float(slopes.mask.beta) == 0.0 and float(slopes.sensor.pitch) == 0.0
-
-
 def test_a_point_known_to_lie_on_an_axis_of_the_mask_is_not_skew_inside_jit():
     """As for a slope in the other coordinate; skew PSFs take many times longer."""
     skew = []
@@ -60,15 +48,6 @@ def test_a_point_known_to_lie_on_an_axis_of_the_mask_is_not_skew_inside_jit():
     assert skew == [False, False, True, True, True]
 
 
-def test_a_point_takes_the_precision_of_its_camera():
-    """Along an axis, too; so does one that is traced."""
-    single, at = cast(CAMERA, "float32"), np.array([0.0, 7.0])
-    path = single.path(500 * nm, 250.0, at)
-    assert path.at.dtype == jnp.float32 and not path.skew
-    traced = jax.eval_shape(lambda at: single.path(500 * nm, 250.0, at).at, jnp.asarray(at))
-    assert traced.dtype == jnp.float32
-
-
 def test_swapped_arguments_are_refused():
     mask = tc.FresnelZoneAperture(25.0, width=1.0)
     sensor = tc.Sensor((3, 4), 0.1)
@@ -76,3 +55,79 @@ def test_swapped_arguments_are_refused():
         tc.LenslessCamera(sensor, mask, 5.0)
     with pytest.raises(TypeError, match="sensor is a NoneType; give a thincam_jax.Sensor"):
         tc.LenslessCamera(mask, None, 5.0)
+
+
+LIGHT = {"wavelength": 5e-4, "width": 2.0}
+SENSOR = tc.Sensor((6, 8), 0.04, electrons=1e5)
+
+
+def test_digits_survive_single_precision():
+    """Numbers of JAX in single precision come back as they were typed."""
+    with jax.enable_x64(False):
+        exposures = tc.Exposures(jnp.asarray([0.1, 25.3]), 6.4, **LIGHT)
+        assert exposures.beta.dtype == jnp.float32
+        assert [e.beta for e in exposures] == [0.1, 25.3]
+
+
+def test_equal_exposures_are_further_takes():
+    exposures = tc.Exposures([25.0, 21.0, 25.0], 6.5, **LIGHT)
+    assert exposures.take == (1, 1, 2)
+    assert len(set(exposures)) == 3
+    # Methods share what they both take.
+    shared = {*tc.Exposures(25.0, 6.5, **LIGHT).fringe_scanned(), *exposures.phase_pairs()}
+    assert len(shared) == 4 + 6 - 2
+
+
+def test_objects_move_on_from_one_to_the_next():
+    """4 mm an exposure; half way through the time it is on the axis."""
+    exposures = tc.Exposures([25.0, 21.0], 6.5, relative_time=[1, 0.5], **LIGHT).of_moving(4.0)
+    np.testing.assert_allclose(exposures.moves, [(-3, 1), (1, 3)])
+    assert exposures[1].moves == (1.0, 3.0)
+
+
+def test_cameras_differ_in_what_exposures_do():
+    mask = tc.FresnelZoneAperture(
+        1.0, width=2.0, height=1.2, profile="binary", pixel_pitch=0.1, fill_factor=0.8, harmonics=3
+    )
+    exposures = tc.Exposures(
+        25.0, [5.0, 6.5], wavelength=5e-4, width=[2.0, 1.0], relative_time=[1, 0.3]
+    )
+    first, second = exposures.cameras(SENSOR, mask)
+    expected = tc.FresnelZoneAperture(
+        25.0, width=1.0, height=1.2, profile="binary", pixel_pitch=0.1, fill_factor=0.8, harmonics=3
+    )
+    assert str(second.mask) == str(expected) and second.mask.pixels == (12, 10)
+    assert float(second.distance) == 6.5
+    assert float(second.sensor.electrons) == pytest.approx(3e4)
+    assert first.sensor is SENSOR
+    with pytest.raises(ValueError, match="not a whole number of cells of pixel_pitch = 0.1 mm"):
+        tc.Exposures(25.0, 5.0, wavelength=5e-4, width=1.13).cameras(SENSOR, mask)
+
+
+def test_gradients_pass_to_the_cameras():
+    def light(beta):
+        exposures = tc.Exposures(beta, [5.0, 6.5], **LIGHT).phase_pairs()
+        return sum(jnp.sum(c.mask.beta**2 * c.distance) for c in exposures.cameras(SENSOR))
+
+    beta = jnp.asarray(25.0)
+    slope = jax.jit(jax.grad(light))(beta)
+    np.testing.assert_allclose(slope, finite_difference(light, beta, jnp.ones(()), 1e-2), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"beta": -1.0}, "beta = -1.0 is negative; give beta >= 0"),
+        ({"beta": [1.0, 2.0], "distance": [1.0, 2.0, 3.0]}, "2 of beta, 3 of distance; give each"),
+        ({"beta": []}, "exposures have 0 of beta; give each one number, or one for each"),
+        ({"beta": np.ones((2, 2))}, r"beta has shape \(2, 2\); give one number, or one for each"),
+        ({"distance": 0.0}, "distance = 0.0 mm must be positive"),
+        ({"wavelength": 500.0}, "is no light: give it in mm"),
+        ({"phase": math.nan}, "phase is NaN"),
+        ({"take": [1, 2, 3], "beta": [1.0, 2.0]}, "2 of beta, 3 of take"),
+    ],
+)
+def test_refused_in_one_line(given, message):
+    with pytest.raises(ValueError, match=message) as error:
+        tc.Exposures(**({"beta": 25.0, "distance": 5.0, **LIGHT} | given))
+    assert "\n" not in str(error.value)

@@ -1,6 +1,7 @@
-"""Light over the field: cosines, pixels, walls and baffles against sums over rays."""
+"""Light over the field by sums over rays, and settings of a PSF method."""
 
 import dataclasses
+import inspect
 import warnings
 
 import jax
@@ -9,8 +10,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.lensless.field import tangents_of
-from thincam_jax.lensless.light import fall_of_light, light_over_field, shading
+from thincam_jax.lensless.field import fall_of_light, light_over_field, shading, tangents_of
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.units import deg, nm, um
 
@@ -73,16 +73,6 @@ def test_a_capture_of_the_axis_says_that_it_has_no_response():
         tc.capture(camera(angular_response=1.0), scene, model=model)
 
 
-@pytest.mark.thorough
-def test_plans_decide_by_it():
-    """At 3° cos⁴θ is 0.3 % off in the mean; a response of cos³⁰⁰θ is not left out."""
-    scene = tc.Scene(tc.ImagePlane(np.ones((8, 12)), 250.0, 20.0), 500 * nm)
-    plain = tc.plan_capture(camera(), scene, tolerance=0.02)
-    steep = tc.plan_capture(camera(angular_response=300.0), scene, tolerance=0.02)
-    assert plain.method.field_tolerance is None
-    assert steep.method.field_tolerance == 1.0
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -110,6 +100,39 @@ def test_shading_is_the_share_of_rays(depth, opening, width):
     np.testing.assert_allclose(found, share, atol=2e-4)
 
 
-def test_shading_refuses():
-    with pytest.raises(ValueError, match="opening"):
-        shading(DOWN, ACROSS, depth=1.0, opening=0.0)
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"model": "exact"}, "^model = 'exact' is unknown; choose one of 'geometric'"),
+        *(
+            ({"precision": name}, r"^precision = .* is unknown; choose one of 'float32'")
+            for name in ("half", "float16", "double", 64)
+        ),
+        ({"oversampling": 3}, "'separable' is a closed form: leave oversampling"),
+        ({"oversampling": 4, "model": "angular_spectrum"}, "oversampling = 4: give an odd number"),
+        ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give a whole number"),
+        ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give a whole"),
+        ({"mask_shape": (3, 0), "model": "angular_spectrum"}, "mask_shape = .* of at least 1"),
+    ],
+)
+def test_settings_that_are_refused(settings, message):
+    """By its own check: that of the annotations, on in the tests, is taken off."""
+    with pytest.raises(ValueError, match=message) as error:
+        tc.PsfMethod.__init__.__wrapped__(object.__new__(tc.PsfMethod), **settings)
+    assert "\n" not in str(error.value)
+
+
+def test_pixels_are_averaged_unless_either_says_no():
+    """By default, as `capture` and `Cameras` do; a method and the function that takes it."""
+    camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((6, 7), 0.05), 2.0)
+    points, average = (
+        tc.psf(camera, wavelength=5e-4, pixel_integration=both) for both in (False, True)
+    )
+    np.testing.assert_array_equal(tc.psf(camera, wavelength=5e-4), average)
+    asked = tc.psf(camera, wavelength=5e-4, model=tc.PsfMethod(pixel_integration=True))
+    np.testing.assert_array_equal(asked, average)
+    method = tc.PsfMethod(pixel_integration=False)
+    np.testing.assert_array_equal(tc.psf(camera, wavelength=5e-4, model=method), points)
+    assert np.abs(points - average).max() > 0.01
+    for function in (tc.psf, tc.otf, tc.mtf, tc.choose_model, tc.predict_error, tc.plot.psf):
+        assert inspect.signature(function).parameters["pixel_integration"].default is True

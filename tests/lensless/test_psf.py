@@ -2,7 +2,6 @@
 
 import importlib
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxtyping
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import count_traces, finite_difference, quick, value_and_slope
+from helpers import count_traces, finite_difference, point_otf, point_psf, quick, value_and_slope
 from thincam_jax.lensless.method import MODELS
 
 INF = float("inf")
@@ -38,11 +37,11 @@ def camera_of(shape=(20, 27), pitch=0.03, *, beta=200.0, phase=0.3, width=0.5, d
 def test_otf_is_the_transform_of_the_psf(model, shape):
     """Σ h e^{−2πj(ux+vy)} pitch² with x, y from the centre of the grid, sizes odd and even."""
     camera = camera_of(shape, centre=(0.05, -0.08))
-    h = np.asarray(tc.psf(camera, wavelength=WAVELENGTH, model=model, pixel_integration=False))
+    h = np.asarray(point_psf(camera, wavelength=WAVELENGTH, model=model))
     y, x = ((np.arange(n) - (n - 1) / 2) * 0.03 for n in shape)
     v, u = (np.fft.fftshift(np.fft.fftfreq(n, 0.03)) for n in shape)
     expected = np.exp(-2j * np.pi * np.outer(v, y)) @ h @ np.exp(-2j * np.pi * np.outer(x, u))
-    H = tc.otf(camera, wavelength=WAVELENGTH, model=model, pixel_integration=False)
+    H = point_otf(camera, wavelength=WAVELENGTH, model=model)
     np.testing.assert_allclose(H, expected * 0.03**2, rtol=0, atol=1e-12)
 
 
@@ -52,9 +51,7 @@ def rho_squared(camera):
 
 def otf_at(phase, *, distance=6.5, beta=25.0, model="paraxial", shape=(30, 41)):
     camera = camera_of(shape, 0.02, beta=beta, phase=phase, distance=distance)
-    return np.asarray(
-        tc.otf(camera, wavelength=WAVELENGTH, model=model, pixel_integration=False)
-    ), rho_squared(camera)
+    return np.asarray(point_otf(camera, wavelength=WAVELENGTH, model=model)), rho_squared(camera)
 
 
 def test_paraxial_otf_is_eq_3_30_corrected():
@@ -90,59 +87,6 @@ def test_closed_form_otf():
     )
     expected[15, 20] += (1 / 4 + (ap**2 + am**2) / 16) * 30 * 41 * 0.02**2
     np.testing.assert_allclose(H, expected, rtol=0, atol=1e-12)
-
-
-def scanned(distance, frequency):
-    """(OTF(3π/2) − OTF(π/2)) + j(OTF(0) − OTF(π)) along u, by `tc.otf` on 1×N sensors."""
-    pitch = 1 / (len(frequency) * (frequency[1] - frequency[0]))
-    responses = {
-        turns: tc.otf(
-            camera_of(
-                (1, len(frequency)), pitch, beta=25.0, phase=turns * np.pi / 2, distance=distance
-            ),
-            wavelength=WAVELENGTH,
-            model="paraxial",
-            pixel_integration=False,
-        )[0]
-        for turns in range(4)
-    }
-    return np.asarray(responses[3] - responses[1] + 1j * (responses[0] - responses[2]))
-
-
-@pytest.mark.parametrize(("distance", "zero"), [(6.5, 12.40), (5.0, 14.14)])
-def test_first_zero_of_the_fringe_scanned_response(distance, zero):
-    """Eq 3.31, corrected: cos(πλdρ²) = 0 at ρ = 1/√(2λd); 12.40 and 14.14 cycles/mm.
-
-    The package keeps both orders' own chirps kβ(1 − kε), so that the response there is a minimum of
-    modulus, not an exact zero; its product with the conjugate geometric response changes sign.
-    """
-    frequency = np.arange(-3000, 3000) * 0.01
-    response = scanned(distance, frequency)
-    compensated = (response * np.exp(-1j * np.pi**2 * frequency**2 / 25.0)).real
-    positive = frequency > 1.0
-    crossing = np.flatnonzero(np.diff(np.sign(compensated[positive])))[0]
-    found = frequency[positive][crossing] + 0.005
-    assert abs(found - zero) < 0.05
-    assert abs(1 / np.sqrt(2 * WAVELENGTH * distance) - zero) < 0.005
-
-
-@pytest.mark.parametrize("distance", [6.5, 5.0])
-def test_eq_3_31_and_3_49_corrected(distance):
-    """From `paraxial_response`: (π/β)e^{jX}cos(πλdρ²), and the pair's difference with its X/2."""
-    from thincam_jax.lensless.propagation.paraxial import paraxial_response
-
-    beta, rho2 = 25.0, np.linspace(0.0, 900.0, 301)
-    x, turn = np.pi**2 * rho2 / beta, np.cos(np.pi * WAVELENGTH * distance * rho2)
-    at = {
-        k: np.asarray(
-            paraxial_response(jnp.asarray(rho2), beta, k * np.pi / 2, WAVELENGTH, distance)
-        )
-        for k in range(4)
-    }
-    scan = at[3] - at[1] + 1j * (at[0] - at[2])
-    np.testing.assert_allclose(scan, np.pi / beta * np.exp(1j * x) * turn, rtol=0, atol=1e-13)
-    pair = np.pi / (2 * beta) * turn * (np.sin(x) - np.cos(x)) + np.pi / (8 * beta) * np.sin(x / 2)
-    np.testing.assert_allclose(at[0] - at[3], pair, rtol=0, atol=1e-13)
 
 
 # --- gradients ------------------------------------------------------------------------------------
@@ -233,16 +177,6 @@ def test_gradients_of_the_sampled_models(model):
     check_gradient(model, 1e-7)
 
 
-@pytest.mark.thorough
-def test_gradient_of_pixel_averages():
-    """Where every parameter moves by its own step, in forward mode: quick to compile."""
-    function = jax.jit(lambda p: weighted(p, "separable", pixel_integration=True))
-    direction = {k: jnp.asarray(v) for k, v in steps(POINT).items()}
-    slope = jax.jit(lambda p, v: jax.jvp(function, (p,), (v,))[1])(POINT, direction)
-    assert abs(slope) > 1e-4
-    np.testing.assert_allclose(slope, finite_difference(function, POINT, direction, 0.3), rtol=1e-7)
-
-
 @pytest.mark.parametrize(
     ("model", "zero"), quick([("paraxial", ("width",)), ("angular_spectrum", ())], 1)
 )
@@ -258,12 +192,8 @@ def test_vmap_is_one_by_one(model):
     betas = jnp.array([150.0, 200.0, 320.0])
 
     def one(beta):
-        return tc.psf(
-            camera_of(beta=beta),
-            wavelength=WAVELENGTH,
-            object_distance=60.0,
-            model=model,
-            pixel_integration=False,
+        return point_psf(
+            camera_of(beta=beta), wavelength=WAVELENGTH, object_distance=60.0, model=model
         )
 
     together = jax.jit(jax.vmap(one))(betas)
@@ -278,13 +208,7 @@ def test_changing_a_value_compiles_nothing():
     @count_traces
     def h(beta, distance, wavelength, t):
         camera = camera_of(beta=beta, distance=distance)
-        return tc.psf(
-            camera,
-            wavelength=wavelength,
-            object_distance=t,
-            model="paraxial",
-            pixel_integration=False,
-        )
+        return point_psf(camera, wavelength=wavelength, object_distance=t, model="paraxial")
 
     compiled = jax.jit(h)
     values = [(200.0, 20.0, 5e-4, 60.0), (190.0, 21.0, 6e-4, 70.0), (150.0, 3.0, 4e-4, 1e9)]
@@ -297,13 +221,7 @@ def test_changing_a_value_compiles_nothing():
             evaluate(camera, wavelength=wavelength, object_distance=t, model="paraxial")
             sizes.append(inner._cache_size())
         assert len(set(sizes)) == 1, sizes
-    once = tc.psf(
-        camera_of(),
-        wavelength=5e-4,
-        object_distance=60.0,
-        model="paraxial",
-        pixel_integration=False,
-    )
+    once = point_psf(camera_of(), wavelength=5e-4, object_distance=60.0, model="paraxial")
     np.testing.assert_allclose(first, once, rtol=0, atol=1e-14)
 
 
@@ -322,25 +240,13 @@ def test_unknown_model_lists_the_known(evaluate, monkeypatch):
     assert len(MODELS) == 7
 
 
-@pytest.mark.parametrize("model", quick(["geometric", "paraxial", "closed_form", "separable"], 2))
-@pytest.mark.parametrize("shape", [pytest.param((1, 1), marks=pytest.mark.thorough), (1, 7)])
-def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
-    wide = tc.psf(camera_of((5, 7)), wavelength=WAVELENGTH, model=model, pixel_integration=False)
-    thin = tc.psf(camera_of(shape), wavelength=WAVELENGTH, model=model, pixel_integration=False)
-    rows = slice(None) if shape[0] == 5 else slice(2, 3)
-    columns = slice(None) if shape[1] == 7 else slice(3, 4)
-    np.testing.assert_allclose(thin, wide[rows, columns], rtol=0, atol=1e-13)
-
-
 @pytest.mark.thorough
 def test_mask_wider_than_its_plane_inside_jit():
     """A traced width cannot choose the plane: that is the sensor's, too small for this mask."""
 
     def energy(width):
         camera = camera_of(width=width)
-        return jnp.sum(
-            tc.psf(camera, wavelength=WAVELENGTH, model="angular_spectrum", pixel_integration=False)
-        )
+        return jnp.sum(point_psf(camera, wavelength=WAVELENGTH, model="angular_spectrum"))
 
     compiled = jax.jit(energy)
     assert compiled(jnp.asarray(0.5)) > 0
@@ -355,15 +261,14 @@ def test_sizes_that_do_not_fit_are_refused_at_once():
     with pytest.raises(
         MemoryError, match=r"1000000×1000000 pixels by model 'separable' needs about 7.3 TiB"
     ):
-        tc.psf(camera, wavelength=WAVELENGTH, pixel_integration=False)
+        point_psf(camera, wavelength=WAVELENGTH)
     with pytest.raises(
         MemoryError, match="'angular_spectrum' needs about .* are free; use a smaller"
     ):
-        tc.psf(
+        point_psf(
             camera_of((3000, 2000)),
             wavelength=WAVELENGTH,
             model=tc.PsfMethod("angular_spectrum", oversampling=99),
-            pixel_integration=False,
         )
 
 
@@ -373,48 +278,12 @@ def test_mask_without_terms_needs_a_sampled_model():
         with pytest.raises(
             TypeError, match=f"{model}.*RadialMask.*'radial', 'angular_spectrum' or 'rayleigh_"
         ):
-            tc.psf(camera, wavelength=WAVELENGTH, model=model, pixel_integration=False)
-
-
-def test_display_pixels_need_an_edge():
-    with pytest.raises(ValueError, match="'closed_form' has no display pixels; drop pixel_pitch"):
-        tc.psf(
-            camera_of(pixel_pitch=0.1),
-            wavelength=WAVELENGTH,
-            model="closed_form",
-            pixel_integration=False,
-        )
+            point_psf(camera, wavelength=WAVELENGTH, model=model)
 
 
 def test_a_grid_replaces_the_sensor():
-    elsewhere = tc.psf(
-        camera_of().on_grid(tc.Grid((3, 4), 0.05)),
-        wavelength=WAVELENGTH,
-        model="geometric",
-        pixel_integration=False,
+    elsewhere = point_psf(
+        camera_of().on_grid(tc.Grid((3, 4), 0.05)), wavelength=WAVELENGTH, model="geometric"
     )
-    same = tc.psf(
-        camera_of((3, 4), 0.05), wavelength=WAVELENGTH, model="geometric", pixel_integration=False
-    )
+    same = point_psf(camera_of((3, 4), 0.05), wavelength=WAVELENGTH, model="geometric")
     np.testing.assert_array_equal(elsewhere, same)
-
-
-def test_leaves_are_arrays():
-    """Every number of the camera is a leaf that can be differentiated, none is frozen."""
-    leaves = jax.tree.leaves(eqx.filter(camera_of(), eqx.is_inexact_array))
-    assert len(leaves) == len(jax.tree.leaves(camera_of())) == 8
-
-
-def test_mask_wider_than_the_sensor_inside_jit():
-    """Its plane's size must be given there; it is then the eager result."""
-    camera = tc.LenslessCamera(
-        tc.FresnelZoneAperture(25.0, 0.3, width=0.4), tc.Sensor((8, 7), 0.01), 6.5
-    )
-    expected = tc.psf(
-        camera, wavelength=WAVELENGTH, model="angular_spectrum", pixel_integration=False
-    )
-    method = tc.PsfMethod("angular_spectrum", mask_shape=(40, 41))
-    found = jax.jit(
-        lambda c: tc.psf(c, wavelength=WAVELENGTH, model=method, pixel_integration=False)
-    )(camera)
-    np.testing.assert_allclose(found, expected, rtol=1e-10)

@@ -8,7 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import quick
-from thincam_jax.lensless.sampling import SamplingWarning
+from thincam_jax.lensless.resolve import SamplingWarning
 from thincam_jax.units import um
 
 SCENE = tc.Scene(tc.ImagePlane(np.ones((3, 4)), distance=250.0, width=60.0), 5e-4)

@@ -1,7 +1,15 @@
+"""Mosaics, the clean-up of a PSF, and its dark corner."""
+
+import warnings
+
 import numpy as np
 import pytest
+import scipy.ndimage
 
+from thincam_jax.measured import Raw, prepare
 from thincam_jax.measured.bayer import PATTERNS, demosaic, demosaic_mask, mosaic
+from thincam_jax.measured.merging import find_levels
+from thincam_jax.measured.preparation import centre_psf, clean
 
 
 def mosaic_of(image, pattern):
@@ -82,3 +90,117 @@ def test_what_is_refused():
         demosaic(np.zeros((5, 6)), "RGGB", "superpixel")
     with pytest.raises(ValueError, match=r"has 1×6 pixels; give at least 2×2"):
         demosaic(np.zeros((1, 6)), "RGGB")
+
+
+def test_noise_level_counts_where_it_is_the_larger():
+    psf = np.array([[[8.0, 1.0, 0.5, 0.2]]])
+    for noise, kept in ((0.3, 2), (0.1, 3), (0.01, 4)):
+        found, record = clean(psf, np.array([noise]), 0.02, 3)
+        assert np.count_nonzero(found) == kept
+        np.testing.assert_allclose(record.level, [max(0.16, 3 * noise)])
+    found, record = clean(psf, np.array([0.3]))
+    np.testing.assert_array_equal(found, psf)
+    assert record.zeroed == record.light_removed == 0
+
+
+@pytest.mark.parametrize("by", ["centroid", "peak", "symmetry"])
+@pytest.mark.parametrize("size", [(9, 12), (8, 11)])
+def test_a_single_pixel_comes_to_the_origin_of_a_dft(by, size):
+    psf = np.zeros((2, *size), np.float32)
+    psf[:, 1, 8] = 3, 1
+    found, record = centre_psf(psf, by)
+    assert np.argwhere(found[0]).tolist() == [[size[0] // 2, size[1] // 2]]
+    assert record.shift == (size[0] // 2 - 1, size[1] // 2 - 8)
+    assert record.light_lost == 0
+    # In the place where a DFT has its origin, by another library:
+    assert np.argwhere(np.fft.ifftshift(found[1])).tolist() == [[0, 0]]
+
+
+def test_the_three_centres_of_a_lopsided_pair():
+    psf = np.zeros((1, 11, 21))
+    psf[0, 4, 3], psf[0, 4, 7] = 1.0, 1.5
+    found = {by: centre_psf(psf, by)[1].found for by in ("centroid", "peak", "symmetry")}
+    np.testing.assert_allclose(found["centroid"], [4, (3 + 1.5 * 7) / 2.5])
+    assert found["peak"] == (4, 7)
+    assert found["symmetry"] == (4, 5)  # of 1 at 3 + 3, 2·1.5 at 3 + 7 and 1.5² at 7 + 7
+
+
+def test_symmetry_is_not_drawn_aside_by_a_bright_side():
+    """A symmetric pattern of irregular dots with one more: the centroid moves, this does not."""
+    generator = np.random.default_rng(9)
+    half = (generator.random((15, 19)) < 0.2) * 1.0
+    pattern = half + half[::-1, ::-1]
+    psf = np.zeros((1, 40, 50))
+    psf[0, 3:18, 20:39] = pattern
+    psf[0, 38, 2] = 10.0
+    centre, record = centre_psf(psf, "symmetry")
+    assert record.found == (10.0, 29.0)
+    assert abs(centre_psf(psf, "centroid")[1].found[0] - 10.0) > 1
+    # 19.5 − 10 and 24.5 − 29, rounded up; the dot leaves the array.
+    assert record.shift == (10, -4)
+    np.testing.assert_array_equal(centre[0, 13:28, 16:35], pattern)
+    np.testing.assert_allclose(record.light_lost, 10 / psf.sum())
+
+
+SHAPE, BLACK = (48, 64), 64
+
+
+def counts(light, seed, noise=3.0):
+    generator = np.random.default_rng(seed)
+    pixels = np.round(BLACK + light + noise * generator.normal(size=light.shape))
+    return Raw(np.clip(pixels, 0, 4095).astype(np.uint16), 12)
+
+
+def zones():
+    y, x = (np.arange(n) - (n - 1) / 2 for n in SHAPE)
+    return 1500 * (1 + np.cos(0.01 * (y[:, None] ** 2 + x**2)))
+
+
+def spots(seed):
+    """A random mask in a dark surround."""
+    light = np.zeros(SHAPE)
+    light[16:32, 20:44] = 3000 * (np.random.default_rng(seed).random((16, 24)) < 0.5)
+    return light
+
+
+def blurred(seed):
+    """A capture, nowhere dark."""
+    light = np.random.default_rng(seed).random(SHAPE)
+    return 800 + 3000 * scipy.ndimage.gaussian_filter(light, 6)
+
+
+def test_a_psf_that_fills_the_sensor_has_no_dark_corner():
+    psf, capture = counts(zones(), 1), counts(blurred(2), 3)
+    with pytest.warns(UserWarning, match="no corner of the PSF .* is dark.*number of counts"):
+        found = prepare(psf, capture)
+    log = found.log
+    assert (log.psf.background, log.capture.background) == ("lowest value", "found with the image")
+    assert log.capture.level == (0.0,) and abs(4095 * log.psf.level[0] - BLACK) < 40
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        prepare(psf, capture, background=BLACK)  # as the warning advises
+        untested = prepare(psf, capture, background="corner").log
+    assert untested.psf.background == "corner" and untested.psf.clipped > 0.5 * psf.pixels.size
+    assert log.psf.clipped < 0.2 * untested.psf.clipped
+
+
+def test_dark_corners_are_found_dark():
+    for seed in range(40):
+        noise = (0.3, 1, 3, 10)[seed % 4]
+        pair = counts(spots(seed), seed, noise), counts(blurred(seed), seed + 100, noise)
+        planes = [one.pixels[None].astype(np.float32) for one in pair]
+        found = find_levels(dict(zip(("psf", "capture"), planes, strict=True)), (5, 15), None)
+        assert set(found.sources.values()) == {"corner"}
+        assert abs(float(found.levels["psf"][0, 0, 0]) - BLACK) < noise
+
+
+def test_another_corner_and_a_capture_that_is_darker():
+    light = spots(1)
+    light[:20, :20] = 2000
+    found = prepare(counts(light, 2), counts(blurred(3), 4))
+    assert found.log.psf.background == "corner" and abs(4095 * found.log.psf.level[0] - 64) < 2
+    light[light == 0] = 600  # ambient light of the PSF alone
+    light[:20, :20] = 600
+    found = prepare(counts(light, 2), counts(spots(3), 4))
+    assert found.log.psf.background == "corner"
+    assert found.log.capture.background == "found with the image"

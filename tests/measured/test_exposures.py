@@ -101,13 +101,6 @@ def test_one_exposure_is_the_mean_of_its_frames():
     np.testing.assert_allclose(merged.rate, expected, rtol=1e-12)
 
 
-def test_no_light_gives_no_light():
-    one = taken(0.2, np.random.default_rng(9), scene=0.0 * SCENE)
-    merged = merge_exposures([one, taken(0.02, np.random.default_rng(10), scene=0.0 * SCENE)], FULL)
-    assert abs(np.mean(merged.rate / np.sqrt(merged.noise_variance))) < 0.05
-    assert merged.valid.all() and merged.gain < 2
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -7,6 +7,7 @@ import numpy as np
 import PIL.Image
 import PIL.TiffImagePlugin
 import pytest
+import rawpy
 import tifffile
 
 from thincam_jax.commands.reconstruct.options import Sources
@@ -20,20 +21,22 @@ RNG = np.random.default_rng(0)
 COLOURS = RNG.uniform(100, 3000, (3, *SHAPE)) * np.array([1.0, 0.7, 0.3])[:, None, None]
 
 
-def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE, more=()):
-    """A DNG 1.4 whose pixels lie as its orientation says."""
+def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE, more=(), sites=()):
+    """A DNG 1.4 whose pixels lie as its orientation says; several levels `black` are in `light`."""
     inverse = {6: 8, 8: 6}.get(orientation, orientation)
-    pixels = upright(np.rint(mosaic(light, pattern)).astype(np.uint16) + black, inverse)
+    level = black if isinstance(black, int) else 0
+    pixels = upright(np.rint(mosaic(np.asarray(light), pattern)).astype(np.uint16) + level, inverse)
     letters = np.select(list(colour_sites(SHAPE, pattern).values()), list("RGB"), "")
-    sites = ["RGB".index(letter) for letter in upright(letters, inverse)[:2, :2].ravel()]
+    bayer = ["RGB".index(letter) for letter in upright(letters, inverse)[:2, :2].ravel()]
+    sites, side = sites or bayer, 6 if sites else 2
     identity = [part for value in np.eye(3, dtype=int).ravel() for part in (int(value), 1)]
     tags = [
         (50706, 1, 4, (1, 4, 0, 0), True),
         (50708, 2, 0, "Test camera", True),
-        (33421, 3, 2, (2, 2), True),
-        (33422, 1, 4, tuple(sites), True),
+        (33421, 3, 2, (side, side), True),
+        (33422, 1, side**2, tuple(sites), True),
         (50721, 10, 9, identity, True),
-        (50714, 4, 1, black, True),
+        (50714, 4, np.size(black), black, True),
         (50717, 4, 1, white, True),
         (50728, 5, 3, (1,) * 6, True),
         (50778, 3, 1, 21, True),
@@ -58,6 +61,41 @@ def test_pattern_levels_and_orientation(tmp_path, suffix, pattern, orientation):
     np.testing.assert_array_equal(raw.pixels, expected)
 
 
+@pytest.mark.parametrize("suffix", ["dng", "tif"])
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_black_levels_of_the_colours_are_made_one(tmp_path, suffix, pattern):
+    """Pixels are raised to the highest level; saturated ones stay at the white level."""
+    levels = np.array([[256, 250], [241, 256]])
+    light = np.rint(np.where(COLOURS > 2500, WHITE, COLOURS))
+    tile = np.tile(levels, (SHAPE[0] // 2, SHAPE[1] // 2))
+    stored = np.minimum(mosaic(light, pattern) + tile, WHITE)
+    more = [(50713, 3, 2, (2, 2), True)]
+    given = {"black": tuple(levels.ravel().tolist()), "more": more}
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(dng(pattern, light=np.stack([stored] * 3), **given))
+    raw = read_image(path)
+    assert (raw.bayer, raw.black_level, raw.white_level) == (pattern, 256, WHITE)
+    expected = np.minimum(np.where(stored < WHITE, stored - tile + 256, WHITE), WHITE)
+    np.testing.assert_array_equal(raw.pixels, expected)
+
+
+@pytest.mark.parametrize("suffix", ["dng", "tif"])
+def test_other_mosaics_are_refused_by_name(tmp_path, suffix):
+    sites = (1, 1, 0, 1, 1, 2, 1, 1, 2, 1, 1, 0, 2, 0, 1, 0, 2, 1)
+    sites += (1, 1, 2, 1, 1, 0, 1, 1, 0, 1, 1, 2, 0, 2, 1, 2, 0, 1)
+    path = tmp_path / f"a.{suffix}"
+    light = np.tile(COLOURS, (1, 16, 12))  # of smaller ones LibRaw interpolates no colours
+    path.write_bytes(dng("RGGB", sites=sites, light=light))
+    with pytest.raises(MeasurementError, match=r"X-Trans, 6×6 pixels.*rawpy\.imread") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+    if suffix == "dng":
+        options = {"gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
+        with rawpy.imread(str(path)) as file:
+            np.save(tmp_path / "a.npy", file.postprocess(**options))
+        assert read_image(tmp_path / "a.npy").channels == 3
+
+
 @pytest.fixture
 def files(tmp_path):
     point = np.zeros((3, *SHAPE))
@@ -65,21 +103,6 @@ def files(tmp_path):
     for name, light in (("psf", point), ("capture", COLOURS)):
         (tmp_path / f"{name}.dng").write_bytes(dng("BGGR", light=light))
     return tmp_path / "psf.dng", tmp_path / "capture.dng"
-
-
-def test_a_dng_works_by_default(files):
-    psf, capture = files
-    found = Inputs(Sources(psf)).prepare(capture)
-    raws = read_image(psf), read_image(capture)
-    expected = prepare(*raws, background=BLACK, options=Preparation(bayer="BGGR"))
-    np.testing.assert_array_equal(found.capture, expected.capture)
-    np.testing.assert_array_equal(found.psf, expected.psf)
-    assert (
-        found.log.options.bayer == "BGGR"
-        and found.log.capture.background == "black level of the file"
-    )
-    means = found.capture.mean(axis=(1, 2))
-    assert means[0] > 1.2 * means[1] > 1.8 * means[2]  # red is red
 
 
 @pytest.mark.parametrize(
@@ -97,13 +120,6 @@ def test_contradictions_are_refused_with_both_values(files, given, message):
     assert "\n" not in str(caught.value)
 
 
-def test_what_the_messages_advise(files):
-    psf, capture = files
-    given = {"preparation": Preparation(bayer="BGGR"), "background": 256.0, "bits": None}
-    found = Inputs(Sources(psf, **given)).prepare(capture)
-    np.testing.assert_array_equal(found.capture, Inputs(Sources(psf)).prepare(capture).capture)
-
-
 def test_facts_are_not_dropped_in_python(files):
     """`prepare` takes pattern and black level of the files, and refuses what contradicts them."""
     raws = [read_image(path) for path in files]
@@ -115,13 +131,6 @@ def test_facts_are_not_dropped_in_python(files):
     )
     assert found.capture.shape == (3, *SHAPE)
     np.testing.assert_array_equal(found.capture, given.capture)
-
-
-def test_two_patterns(files):
-    psf, capture = files
-    psf.write_bytes(dng("RGGB"))
-    with pytest.raises(MeasurementError, match=r"says the pattern BGGR and the PSF's .* RGGB"):
-        Inputs(Sources(psf)).prepare(capture)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -195,3 +204,10 @@ def test_exposure_of_fits(monkeypatch, card):
     monkeypatch.setattr(read, "read_array", lambda kind, data, key: np.ones(SHAPE))
     assert read._read_container("fits", None, header)[1] == {"exposure": 4e-3}
     assert read._read_container("mat", None, header)[1] == {}
+
+
+def test_two_patterns(files):
+    psf, capture = files
+    psf.write_bytes(dng("RGGB"))
+    with pytest.raises(MeasurementError, match=r"says the pattern BGGR and the PSF's .* RGGB"):
+        Inputs(Sources(psf)).prepare(capture)

@@ -7,8 +7,6 @@ import skimage.transform
 
 from helpers import shared_data
 from thincam_jax.measured import Preparation, prepare, read_image
-from thincam_jax.measured.raw import CaptureFileError
-from thincam_jax.measured.read import list_captures
 
 
 @pytest.fixture(scope="module")
@@ -46,16 +44,6 @@ def test_preparation_agrees_with_the_tutorial_steps(raws):
     np.testing.assert_allclose(found.psf.sum(dtype=np.float64), 1.0, rtol=1e-6)
 
 
-def test_saturated_pixels_of_the_psf_show_in_the_log(raws):
-    """Its 12 bits stand at the upper end of 16, so they end at 65520 and not at 65535."""
-    log = prepare(*raws, options=Preparation(downsample=4)).log
-    assert log.psf.saturated == 0
-    assert log.psf.maximum == 4095 * 16
-    assert log.psf.pixels_at_maximum == 192
-    log = prepare(*raws, options=Preparation(downsample=4, saturation=0.9997)).log
-    assert log.psf.saturated == 192
-
-
 def test_stamp_in_the_first_two_pixels_is_left_out_as_dead(raws):
     """The camera wrote numbers there, 4 % of the PSF's peak after averaging."""
     odd = np.argwhere(raws[0].pixels % 16)
@@ -70,14 +58,3 @@ def test_stamp_in_the_first_two_pixels_is_left_out_as_dead(raws):
     ratio = clean.psf[0, 1:] / np.maximum(stamped.psf[0, 1:], 1e-12)
     bright = stamped.psf[0, 1:] > 1e-6
     np.testing.assert_allclose(ratio[bright], ratio[bright].mean(), rtol=1e-5)
-
-
-def test_noise_clean_up_removes_little_light(raws):
-    log = prepare(*raws, options=Preparation(downsample=4, noise_threshold=3)).log
-    assert log.clean_up.zeroed > 10_000
-    assert log.clean_up.light_removed < 1e-3
-
-
-def test_picture_in_the_folder_is_no_capture(folder):
-    with pytest.raises(CaptureFileError, match=r"notebook_output\.png: has transparent pixels"):
-        list_captures(folder)

@@ -1,14 +1,11 @@
 """The whole preparation against the same steps written out in float64."""
 
-import json
 import math
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare
-from thincam_jax.measured.write import log_text
 
 ROWS, COLUMNS = 24, 36
 BLOCKS = Preparation(capture_scale="none", downsample=2)
@@ -63,15 +60,6 @@ def test_dark_frames_and_numbers():
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(found.psf[0], unit_sum(psf.astype(float)), rtol=1e-5)
     assert found.log.psf.background == "number" and found.log.psf.level == (0.0,)
-
-
-def test_raw_data_are_left_as_they_were():
-    psf, capture = measured(3), measured(3, seed=12)
-    kept = psf.copy(), capture.copy()
-    first, second = (prepare(Raw(psf, 12), Raw(capture, 12), background=None) for _ in range(2))
-    np.testing.assert_array_equal(psf, kept[0])
-    np.testing.assert_array_equal(capture, kept[1])
-    np.testing.assert_array_equal(first.capture, second.capture)
 
 
 @pytest.mark.parametrize("psf_sum", ["each", "joint"])
@@ -142,17 +130,6 @@ def test_saturated_pixels_spoil_all_that_they_enter():
     np.testing.assert_allclose(found.log.valid_share, 1 - 9 / expected.size)
 
 
-def test_saturation_below_full_scale_and_of_floats():
-    psf, capture = measured(), measured(seed=12) & 0xFFFE
-    level = capture.max() / 4095
-    for given, saturated in ((None, 0), (level, (capture == capture.max()).sum())):
-        options = Preparation(saturation=given)
-        found = prepare(Raw(psf, 12), Raw(capture, 12), options=options)
-        assert (~found.valid).sum() == saturated
-    bright = capture.astype(np.float32)  # of unknown scale: nothing is known to be full
-    assert prepare(Raw(psf.astype(np.float32)), Raw(bright)).valid.all()
-
-
 def test_dead_pixels_are_left_out_of_means():
     psf, capture = measured(), measured(seed=12)
     dead = np.zeros((ROWS, COLUMNS), bool)
@@ -169,27 +146,6 @@ def test_dead_pixels_are_left_out_of_means():
     assert found.capture[0, 2, 5] in neighbours
     assert found.log.capture.dead == 17
     assert found.psf[0, 2, 5] in [found.psf[0, *p] for p in ((1, 5), (3, 5), (2, 4), (2, 6))]
-
-
-def test_means_over_a_random_map_of_dead_pixels():
-    capture = measured(seed=12)
-    dead = np.random.default_rng(8).random(capture.shape) > 0.5
-    options = Preparation(downsample=3, capture_scale="none")
-    found = prepare(Raw(measured(), 12), Raw(capture, 12), background=0, options=options, dead=dead)
-    assert found.valid.all()
-    for y, x in np.ndindex(ROWS // 3, COLUMNS // 3):
-        block = np.s_[3 * y : 3 * y + 3, 3 * x : 3 * x + 3]
-        mean = capture[block][~dead[block]].mean() / 4095
-        np.testing.assert_allclose(found.capture[0, y, x], mean, rtol=1e-6)
-
-
-def test_odd_sides_are_cropped_centrally():
-    psf, capture = measured(shape=(27, 38)), measured(shape=(27, 38), seed=12)
-    options = Preparation(downsample=4, capture_scale="none")
-    found = prepare(Raw(psf, 12), Raw(capture, 12), background=0, options=options)
-    expected = blocks(capture[1:25, 1:37].astype(float), 4) / 4095
-    np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5)
-    assert found.log.first_pixel == (1, 1) and found.log.cropped_to == (24, 36)
 
 
 def test_noise_of_the_corner_sets_the_threshold():
@@ -224,16 +180,6 @@ def test_centring_shifts_all_channels_alike():
     assert found.log.centring.shift == (-6, -2)
     assert np.argwhere(found.psf[0]).tolist() == [[12, 18]]
     assert np.argwhere(found.psf[2]).tolist() == [[12, 18], [13, 18]]
-
-
-def test_the_log_is_plain_json():
-    psf, capture = measured(3), measured(3, seed=12)
-    options = Preparation(centre="centroid", threshold=0.01, downsample=2)
-    log = prepare(Raw(psf, 12), Raw(capture, 12), options=options).log
-    written = json.loads(json.dumps(asdict(log), allow_nan=False))
-    assert written == json.loads(log_text(log))
-    assert written["options"]["downsample"] == 2 and written["centring"]["shift"] == [-1, -2]
-    assert log.psf.pixels_at_maximum == (psf == psf.max()).sum()
 
 
 def refused(message, psf, capture, background=None, options=None, **keywords):
@@ -275,15 +221,6 @@ def test_backgrounds_that_do_not_belong():
     prepare(floats, grey, background=40.0)  # as it advises
     assert (log.psf.background, log.capture.background) == ("corner", "found with the image")
     refused("background = nan: give a finite number", grey, grey, math.nan)
-
-
-def test_black_images():
-    grey, black = Raw(measured(), 12), Raw(np.zeros((ROWS, COLUMNS), np.uint16), 12)
-    refused("the PSF is black in channel 0", black, grey, 0)
-    refused("the capture is black", grey, black)
-    refused("the PSF is black", grey, grey, 4095)
-    dead = np.ones((ROWS, COLUMNS), bool)
-    refused("the PSF has a channel of dead pixels only", grey, grey, dead=dead)
 
 
 def blob(shape, pitch):
@@ -339,3 +276,12 @@ def test_crop_leaves_the_psf_whole():
     assert not found.valid[0, 0, 0]
     with pytest.raises(MeasurementError, match=r"lies outside of the capture of 24×36 pixels"):
         prepare(psf, capture, background=0, options=Preparation(crop=((0, 25), (0, 36))))
+
+
+def test_black_images():
+    grey, black = Raw(measured(), 12), Raw(np.zeros((ROWS, COLUMNS), np.uint16), 12)
+    refused("the PSF is black in channel 0", black, grey, 0)
+    refused("the capture is black", grey, black)
+    refused("the PSF is black", grey, grey, 4095)
+    dead = np.ones((ROWS, COLUMNS), bool)
+    refused("the PSF has a channel of dead pixels only", grey, grey, dead=dead)

@@ -12,12 +12,12 @@ import numpy as np
 import PIL.Image
 import pytest
 import tifffile
-from imagecodecs import jpeg8_encode, png_encode
+from imagecodecs import png_encode
 
 from thincam_jax._core import memory
 from thincam_jax.measured import Raw, read_image, read_pixel_map
 from thincam_jax.measured.raw import CaptureFileError
-from thincam_jax.measured.read import NonlinearWarning, read_images
+from thincam_jax.measured.read import read_images
 
 SHAPE = (7, 10)
 
@@ -89,19 +89,6 @@ def test_a_camera_s_raw_file_gives_its_mosaic(tmp_path, monkeypatch):
         read_image(tmp_path / "a.DNG")
 
 
-def test_a_jpeg_is_read_with_a_warning(tmp_path):
-    pixels = np.tile(np.arange(0, 240, 10, dtype=np.uint8)[:, None], (1, 16))
-    (tmp_path / "a.jpg").write_bytes(jpeg8_encode(pixels, level=95))
-    with pytest.warns(NonlinearWarning, match=r"a\.jpg: a JPEG's counts .* as TIFF or PNG"):
-        raw = read_image(tmp_path / "a.jpg")
-    assert (raw.format, raw.bits) == ("jpeg", 8)
-    assert np.abs(raw.pixels.astype(int) - pixels).max() < 8
-    whole = (tmp_path / "a.jpg").read_bytes()
-    (tmp_path / "b.jpg").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(CaptureFileError, match="cannot be read as JPEG"):
-        read_image(tmp_path / "b.jpg")
-
-
 def test_colours_of_16_bit_in_png_need_more_decoders(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imagecodecs", None)  # as where it is not installed
     grey, colour = counts(np.uint16), counts(np.uint16, 3)
@@ -153,11 +140,6 @@ def test_planes_one_after_the_other_become_channels_last(tmp_path):
     planes = np.moveaxis(pixels, -1, 0)
     write_tiff(tmp_path / "a.tif", planes, photometric="rgb", planarconfig="separate")
     same(read_image(tmp_path / "a.tif"), pixels, "tiff", 16)
-
-
-def test_the_first_bytes_tell_the_format_not_the_name(tmp_path):
-    (tmp_path / "a.tif").write_bytes(png_encode(counts(np.uint8, 3)))
-    assert read_image(tmp_path / "a.tif").format == "png"
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -256,24 +238,6 @@ def test_stacks_are_refused(tmp_path):
     frames = [PIL.Image.fromarray(counts(np.uint8, seed=n)) for n in (1, 2)]
     frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])
     refused(tmp_path / "a.png", "is animated")
-
-
-def test_preview_beside_the_image_is_ignored(tmp_path):
-    pixels = counts(np.uint16)
-    with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
-        writer.write(pixels[::2, ::2], photometric="minisblack", subfiletype=1)
-        writer.write(pixels, photometric="minisblack")
-    same(read_image(tmp_path / "a.tif"), pixels, "tiff", 16)
-
-
-def test_colours_that_are_no_counts(tmp_path):
-    grey = PIL.Image.fromarray(counts(np.uint8))
-    grey.convert("P").save(tmp_path / "a.png")
-    refused(tmp_path / "a.png", "stores a palette")
-    grey.convert("1").save(tmp_path / "b.png")
-    refused(tmp_path / "b.png", "has 1 bit a sample")
-    write_tiff(tmp_path / "a.tif", counts(np.uint8), photometric="miniswhite")
-    refused(tmp_path / "a.tif", "stores colours as MINISWHITE")
 
 
 def whole_files(folder):
@@ -379,3 +343,13 @@ def test_masks(tmp_path):
     write_npy(tmp_path / "a.npy", np.zeros((3, 4, 3), bool))
     with pytest.raises(CaptureFileError, match=r"give a map \(y, x\)"):
         read_pixel_map(tmp_path / "a.npy")
+
+
+def test_colours_that_are_no_counts(tmp_path):
+    grey = PIL.Image.fromarray(counts(np.uint8))
+    grey.convert("P").save(tmp_path / "a.png")
+    refused(tmp_path / "a.png", "stores a palette")
+    grey.convert("1").save(tmp_path / "b.png")
+    refused(tmp_path / "b.png", "has 1 bit a sample")
+    write_tiff(tmp_path / "a.tif", counts(np.uint8), photometric="miniswhite")
+    refused(tmp_path / "a.tif", "stores colours as MINISWHITE")

@@ -169,11 +169,6 @@ def test_two_sigma_cover_or_the_findings_say_why(simulated):
             assert sum(off) <= 12, (truth.name, name)  # 5 of 100 by chance
 
 
-def test_flicker_of_the_lamp_is_no_noise(sensor):
-    found = measure_sensor([sensor.taken(t, 8, 8, flicker=0.05) for t in TIMES], full_scale=FULL)
-    assert abs(found.conversion_gain - GAIN) < 4 * found.conversion_gain_error
-
-
 def test_exposures_that_are_too_bright_are_left_out(sensor):
     series = [sensor.taken(one) for one in (*TIMES, 0.26, 0.5)]  # 0.9 of full scale, saturated
     found = measure_sensor(series, full_scale=FULL)
@@ -193,15 +188,6 @@ def test_corrected_frames_are_even_and_have_the_variance_that_they_say(sensor, f
     assert not light[~good].any() and not variance[~good].any()
     dark, variance = found.at(0.4).correct(sensor.raw(0.4, 0.0))
     assert abs(np.mean(dark[good] / np.sqrt(variance[good]))) < 0.1
-
-
-def test_one_exposure_says_nothing_of_another(sensor):
-    one = measure_sensor([sensor.taken(0.1)], full_scale=FULL)
-    assert not one.dark_rate.any() and not one.dark_rate_error.any()
-    assert np.array_equal(one.at(0.1).dark_level, one.dark_level)
-    assert abs(one.conversion_gain - GAIN) < 4 * one.conversion_gain_error
-    with pytest.raises(MeasurementError, match="all dark frames have 0.1 s .* a second exposure"):
-        one.at(0.2)
 
 
 def test_a_mosaic_has_the_mean_response_1_at_each_place(sensor):
@@ -258,13 +244,6 @@ def test_damaged_files_are_refused_in_a_line(found, tmp_path):
 def test_what_cannot_be_measured_is_refused(sensor, change, message):
     with pytest.raises(MeasurementError, match=message):
         measure_sensor(change(sensor.taken(0.1)), full_scale=FULL)
-
-
-def test_frames_of_other_pixels_are_refused(found):
-    with pytest.raises(MeasurementError, match="same region, binning and pixel format"):
-        found.correct(Raw(np.zeros((4, 5), np.uint16), bits=12))
-    with pytest.raises(MeasurementError, match="give frames of the same"):
-        found.correct(Raw(np.zeros(SHAPE, np.uint16)))  # of 16 bits
 
 
 def prepared(sensor, found, options, seen=None, **given):
@@ -326,3 +305,12 @@ def test_a_preparation_of_other_pixels_is_refused(found, pixels):
     raw = Raw(pixels, bits=12)
     with pytest.raises(MeasurementError, match="same region, binning and pixel format"):
         prepare(raw, raw, background=found, options=Preparation(corner=(1, 4)))
+
+
+def test_one_exposure_says_nothing_of_another(sensor):
+    one = measure_sensor([sensor.taken(0.1)], full_scale=FULL)
+    assert not one.dark_rate.any() and not one.dark_rate_error.any()
+    assert np.array_equal(one.at(0.1).dark_level, one.dark_level)
+    assert abs(one.conversion_gain - GAIN) < 4 * one.conversion_gain_error
+    with pytest.raises(MeasurementError, match="all dark frames have 0.1 s .* a second exposure"):
+        one.at(0.2)

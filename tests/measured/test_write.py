@@ -1,16 +1,15 @@
-import json
-import math
-import os
-from pathlib import Path
+"""Images that are written, listed and displayed."""
 
-import jax.numpy as jnp
+import os
+
 import numpy as np
 import PIL.Image
 import pytest
 import tifffile
 
 from thincam_jax.measured import MeasurementError, read_image, to_display, write_image
-from thincam_jax.measured.write import log_text
+from thincam_jax.measured.raw import CaptureFileError
+from thincam_jax.measured.read import list_captures
 
 IMAGE = np.random.default_rng(17).normal(size=(3, 6, 9)).astype(np.float32)
 
@@ -37,38 +36,6 @@ def test_png_is_what_is_displayed(tmp_path, channels):
     np.testing.assert_array_equal(read_image(path).pixels, expected)
 
 
-def test_the_log_stands_beside(tmp_path):
-    log = {"b": math.nan, "a": {"z": [1, math.inf, 2.5], "y": (True, None)}, "π": "ä"}
-    write_image(tmp_path / "deep.name.png", IMAGE, log)
-    text = (tmp_path / "deep.name.json").read_text(encoding="utf-8")
-    assert json.loads(text) == {"a": {"y": [True, None], "z": [1, None, 2.5]}, "b": None, "π": "ä"}
-    assert text.index('"a"') < text.index('"y"') < text.index('"z"') < text.index('"b"')
-    assert text == log_text(dict(reversed(log.items())))
-
-
-def test_numbers_and_arrays_of_numpy_and_jax_are_plain_in_the_log():
-    log = {
-        "int": np.uint16(7),
-        "float": np.float32(0.5),
-        "bool": np.bool_(True),
-        "array": np.array([[1.0, -np.inf]]),
-        "jax": jnp.asarray(3),
-        "path": Path("a") / "b",
-        3: "key",
-    }
-    assert json.loads(log_text(log)) == {
-        "int": 7,
-        "float": 0.5,
-        "bool": True,
-        "array": [[1.0, None]],
-        "jax": 3,
-        "path": os.path.join("a", "b"),
-        "3": "key",
-    }
-    with pytest.raises(TypeError, match="a log holds numbers, texts, lists and dicts, not object"):
-        log_text({"a": object()})
-
-
 @pytest.mark.parametrize("suffix", [".png", ".npy", ".tif"])
 def test_ctrl_c_before_the_rename_leaves_the_old_image(tmp_path, monkeypatch, suffix):
     path = write_image(tmp_path / f"a{suffix}", IMAGE)
@@ -92,3 +59,85 @@ def test_nothing_is_written_where_something_is_wrong(tmp_path):
     with pytest.raises(TypeError):
         write_image(tmp_path / "a.npy", IMAGE, {"a": object()})
     assert list(tmp_path.iterdir()) == []
+
+
+def save(path, shape=(4, 6)):
+    with path.open("wb") as file:  # numpy.save would add a suffix
+        np.save(file, np.full(shape, 2000, np.uint16))
+
+
+def test_captures_in_the_order_of_their_numbers(tmp_path):
+    for name in ("b_10.npy", "b_9.NPY", "a_2_x.tif", "a_11.png", "a_2.tiff"):
+        save(tmp_path / name)
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "._b_9.npy").touch()
+    (tmp_path / "folder.png").mkdir()
+    found = list_captures(str(tmp_path))
+    names = ["a_2.tiff", "a_2_x.tif", "a_11.png", "b_9.NPY", "b_10.npy"]
+    assert sorted(p.name for p in found) == sorted(names)
+    numbered = [p.name for p in found]
+    assert numbered.index("b_9.NPY") < numbered.index("b_10.npy")
+    assert numbered.index("a_2.tiff") < numbered.index("a_11.png") < numbered.index("b_9.NPY")
+    assert list_captures(tmp_path) == found
+
+
+def refused(folder, message, *arguments):
+    with pytest.raises(CaptureFileError, match=message) as caught:
+        list_captures(folder, *arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_odd_one_out_is_named(tmp_path):
+    for name in ("a.npy", "b.npy", "c.npy"):
+        save(tmp_path / name)
+    save(tmp_path / "a0.npy", (6, 4))
+    refused(tmp_path, r"a0\.npy: has shape \(6, 4\), others, as .\.npy, have \(4, 6\)")
+    save(tmp_path / "a0.npy", (4, 6, 3))
+    refused(tmp_path, r"a0\.npy: has shape \(4, 6, 3\)")
+
+
+def test_what_cannot_be_listed(tmp_path):
+    refused(tmp_path / "absent", "cannot be read as a folder")
+    refused(tmp_path, "holds no capture; give a folder of TIFF, PNG, NPY or raw files")
+    save(tmp_path / "a.npy")
+    refused(tmp_path / "a.npy", "cannot be read as a folder")
+    refused(tmp_path, r"a\.npy: holds values up to 2000, above the 1023 of 10 bit", 10)
+    (tmp_path / "b.png").write_bytes(b"\x89PNG")
+    refused(tmp_path, r"b\.png: is empty or cut short")
+
+
+def test_grey_values_by_the_formula():
+    image = np.array([[[0.0, 0.25, 1.0], [-3.0, 0.5, 0.01]]])
+    found = to_display(image, percentile=100)
+    expected = [[round(255 * max(v, 0.0) ** (1 / 2.2)) for v in row] for row in image[0].tolist()]
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(
+        to_display(8 * image, percentile=100, gamma=1),
+        [[0, 64, 255], [0, 128, 3]],  # 63.75, 127.5 to even, 2.55
+    )
+
+
+def test_a_few_bright_pixels_do_not_darken_the_rest():
+    image = np.full((1, 40, 50), 0.5)
+    image[0, 3, 4] = 100.0  # one of 2000; two would be 0.1 %
+    found = to_display(image, gamma=1)
+    assert (found == 255).all()
+    assert to_display(image, gamma=1, percentile=100)[0, 0] == 1
+    # A percentile of 0 is no white: the maximum is.
+    image = np.zeros((1, 80, 100))
+    image[0, 3, 4], image[0, 5, 6] = 2.0, 1.0
+    found = to_display(image, gamma=1)
+    assert found[3, 4] == 255 and found[5, 6] == 128
+
+
+def test_colours_go_last_and_are_balanced():
+    image = np.random.default_rng(16).random((3, 20, 30)).astype(np.float32)
+    image *= np.array([1.0, 2.0, 0.5], np.float32)[:, None, None]
+    gains = to_display(image, white_balance=(2, 1, 4), gamma=1, percentile=100)
+    scaled = np.moveaxis(image.astype(float) * np.array([2, 1, 4])[:, None, None], 0, -1)
+    np.testing.assert_array_equal(gains, np.round(255 * scaled / scaled.max()))
+    grey = to_display(image, white_balance="grey_world", gamma=1, percentile=100)
+    means = grey.reshape(-1, 3).mean(axis=0)
+    np.testing.assert_allclose(means, means.mean(), rtol=2e-3)
+    assert np.ptp(to_display(image, gamma=1).reshape(-1, 3).mean(axis=0)) > 50

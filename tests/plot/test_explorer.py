@@ -3,9 +3,6 @@
 import io
 import json
 import re
-import shutil
-import subprocess
-import tomllib
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +12,6 @@ import pytest
 from jax import monitoring
 
 import thincam_jax as tc
-from helpers import ROOT
-from thincam_jax.plot.explore import MODULE
 from thincam_jax.plot.explorer import Explorer
 from thincam_jax.units import nm, um
 
@@ -110,19 +105,6 @@ def test_moving_compiles_nothing(explorer, moves):
     assert len(compiled) > before  # they are counted
 
 
-@pytest.mark.thorough
-def test_other_masks_have_their_own_numbers():
-    mask = tc.ModifiedUniformlyRedundantArray(13, cell=0.2)
-    found = Explorer(tc.LenslessCamera(mask, SENSOR, distance=5.0), np.eye(40))
-    names = [control.name for control in found.controls]
-    assert names == ["cell", "distance", "angle", "wavelength", "object_distance", "tolerance"]
-    found.turn({"cell": 0.15})
-    assert float(found.camera.mask.cell) == pytest.approx(0.15)
-    view = found.view()
-    assert view.lines[0].startswith("One capture of 96×256 pixels at 30 dB, Wiener filter: ")
-    assert view.zero is None
-
-
 @pytest.mark.parametrize(
     ("values", "line"),
     [
@@ -135,14 +117,6 @@ def test_what_cannot_be_turned(values, line, explorer):
     with pytest.raises((ValueError, TypeError), match=line):
         explorer.turn(values)
     assert explorer.values == before
-
-
-def test_scenes_and_sensors_that_cannot_be_explored():
-    with pytest.raises(ValueError, match=r"scene has shape \(3, 20, 20\); give one image"):
-        Explorer(CAMERA, jnp.ones((3, 20, 20)))
-    large = tc.LenslessCamera(CAMERA.mask, tc.Sensor((64, 4096), 5 * um), distance=5.0)
-    with pytest.raises(ValueError, match="give one of at most 2048 a side"):
-        Explorer(large)
 
 
 def test_the_widget_answers_what_its_module_asks(monkeypatch):
@@ -162,56 +136,9 @@ def test_the_widget_answers_what_its_module_asks(monkeypatch):
     }
 
 
-def test_the_module_of_the_widget_needs_no_build():
-    """What it imports and exports: nothing, and what the widget and the pages call."""
-    text = MODULE.read_text("utf-8")
-    assert not re.search(r"^\s*import\b|\bimport\s*\(|\brequire\s*\(|\bfrom\s+[\"']", text, re.M)
-    assert re.findall(r"^export (\w+ \w*)", text, re.M) == [
-        "function mount",
-        "function byFetch",
-        "default ",
-    ]
-    with (ROOT / "pyproject.toml").open("rb") as file:
-        extras = tomllib.load(file)["project"]["optional-dependencies"]
-    assert {re.match(r"\w+", one)[0] for one in extras["notebook"]} == {
-        "anywidget",
-        "starlette",
-        "uvicorn",
-    }
-
-
-# A page without a browser: what is asked for comes when it is told to, and so do the ticks.
-STANDING = """
-import { mount } from "./explorer.mjs";
-const made = [], ticks = new Map();
-const node = () => ({ dataset: {}, classList: { toggle() {} }, addEventListener() {},
-                      appendChild(one) { made.push(one); return one; } });
-globalThis.document = { createElement: node, addEventListener() {} };
-globalThis.setTimeout = () => 0;
-globalThis.setInterval = (tick) => ticks.set(ticks.size + 1, tick).size;
-globalThis.clearInterval = (number) => ticks.delete(number);
-for (const live of [false, true]) {
-  let come;
-  mount(node(), [], () => new Promise((done) => { come = come ?? done; }), {}, live);
-  const [lines] = made.filter((one) => one.className === "tc-lines").slice(-1);
-  const told = [lines.textContent];
-  ticks.forEach((tick) => tick());
-  told.push(lines.textContent);
-  come([{ names: [], transfer: [], lines: ["PSNR 20 dB."], values: {} }, []]);
-  await new Promise(setImmediate);
-  console.log(JSON.stringify([...told, lines.textContent, live ? 1 : ticks.size]));
-}
-"""
-
-
-def test_the_page_says_that_it_computes_until_an_answer_comes(tmp_path):
-    node = shutil.which("node") or pytest.skip("node is not installed")
-    shutil.copy(MODULE, tmp_path / "explorer.mjs")
-    (tmp_path / "page.mjs").write_text(STANDING, "utf-8")
-    found = subprocess.run([node, "page.mjs"], cwd=tmp_path, capture_output=True, text=True)
-    assert not found.stderr
-    (before, *still), (_, *live) = map(json.loads, found.stdout.splitlines())
-    assert before is None
-    assert still[0].startswith("Computing… A first reconstruction is compiled")
-    assert live[0].startswith("Waiting for the next frame… ")
-    assert still[1] == live[1] == "PSNR 20 dB." and not still[2]
+def test_scenes_and_sensors_that_cannot_be_explored():
+    with pytest.raises(ValueError, match=r"scene has shape \(3, 20, 20\); give one image"):
+        Explorer(CAMERA, jnp.ones((3, 20, 20)))
+    large = tc.LenslessCamera(CAMERA.mask, tc.Sensor((64, 4096), 5 * um), distance=5.0)
+    with pytest.raises(ValueError, match="give one of at most 2048 a side"):
+        Explorer(large)

@@ -135,11 +135,6 @@ def test_a_connection_without_a_request_is_ended(address, said, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_half_a_body_is_not_waited_for(address, capfd):
-    assert viewed(address, b"12345", 400) == b""
-    assert capfd.readouterr().err == ""
-
-
 SERVED = """
 import sys
 from thincam_jax.plot.page import serve

@@ -1,7 +1,7 @@
 """ADMM against a primal-dual solver on dense matrices, and how its method gets to the minimum."""
 
 import itertools
-from dataclasses import astuple, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,13 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reconstruction import dense, rig, scenes
+from reconstruction import dense, scenes
 
-import thincam_jax as tc
 from helpers import count_traces, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
-from thincam_jax.reconstruction import iterate as module
 from thincam_jax.reconstruction.admm import AdmmMethod, Penalties, admm_map, consensus
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import InverseProblem, objective
@@ -186,16 +184,6 @@ def test_relaxation_and_penalties_do_not_move_the_minimiser(relaxation, factors)
     assert relative_l2(value, expected) < 1e-6
 
 
-@pytest.mark.parametrize("factor", quick([1e-8, 1e8], 0))
-def test_units_do_not_matter(factor):
-    """Captures and τ times a number, in single precision: the image times that number."""
-    problem, _ = scenes.problem()
-    expected = solved(scenes.single(problem), iterations=50)
-    value = solved(scenes.single(scenes.rescaled(problem, factor)), iterations=50)
-    assert value.dtype == jnp.float32
-    assert relative_l2(value, factor * expected) < 1e-4
-
-
 def test_a_batch_is_its_elements_and_new_values_compile_once():
     """The same by a leading axis and by vmap over the captures."""
     problem, _ = scenes.problem(batch=(2,), channels=1)
@@ -339,64 +327,3 @@ def test_balanced_penalties_keep_the_image():
     # nothing is rebuilt for a balance that is good enough
     even = replace(residuals, parts=((1.1, 1.0), (1.0, 1.1), (0.0, 1.0)))
     assert method.adapt(state, even)[0] is method
-
-
-def test_no_light_converges_at_once_and_nan_has_a_status():
-    problem, _ = scenes.problem()
-    dark = eqx.tree_at(
-        lambda p: p.captures, problem, tuple(jnp.zeros_like(c) for c in problem.captures)
-    )
-    outcome = driven(dark, iterations=50)
-    assert (outcome.status, outcome.iterations) == ("converged", 10)
-    np.testing.assert_array_equal(outcome.image, 0)
-    broken = (problem.captures[0].at[0, 0, 0].set(jnp.nan), problem.captures[1])
-    outcome = driven(eqx.tree_at(lambda p: p.captures, problem, broken), iterations=50)
-    assert outcome.status == "non_finite"
-
-
-@pytest.mark.thorough
-def test_ten_iterations_are_ten_times_one_by_one_program():
-    problem, _ = scenes.problem((9, 8), (6, 7), kernel=scenes.spots, captures=1)
-    method, images = admm_method(problem), []
-    size = module._advance_donated._cached._cache_size()
-    for count in (1, module.CHUNK):
-        state = method.start(jnp.zeros(problem.image_shape))
-        for _ in range(module.CHUNK // count):
-            state = method.advance(state, count)
-        images.append(method.image(state))
-    assert module._advance_donated._cached._cache_size() == size + 1
-    np.testing.assert_allclose(*images, rtol=1e-10)
-
-
-@pytest.mark.thorough
-def test_single_precision_and_no_new_compilation():
-    """New captures, τ, relaxation and penalties of old shapes; all residuals are finite."""
-    problem, _ = scenes.problem()
-    expected = driven(problem, iterations=30, tolerance=0.0)
-    value = driven(scenes.single(problem), iterations=30, tolerance=0.0)
-    assert value.image.dtype == jnp.float32
-    assert relative_l2(value.image, expected.image) < 1e-4
-    assert all(np.isfinite(astuple(p)).all() for p in value.history[1:])
-    size = module._advance_donated._cached._cache_size()
-    other = scenes.absolute(scenes.rescaled(problem, 3.0), 0.1)
-    driven(other, iterations=30, tolerance=0.0, relaxation=1.1)
-    penalties = weighed(problem, (0.3, 2.0, 1.5)).penalties
-    method = AdmmMethod(problem, splitting_of(problem).with_penalties(penalties))
-    method.advance(method.start(expected.image), 20)
-    assert module._advance_donated._cached._cache_size() == size
-    assert rig.correlation(expected.image, value.image) > 0.999
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("bin_by, most", [(8, 100), (4, 130)])
-def test_what_500_plain_iterations_reach_in_a_quarter_of_them(optimised, bin_by, most):
-    """A measured capture, with the relaxation and the balance of `AdmmTV`: 80 and 110."""
-    raw, psf = scenes.hand(bin_by)
-    recording = tc.Recording(raw[None], tc.Psfs(psf[None]))
-    plain = driven(
-        recording.problem(), iterations=500, tolerance=0.0, relaxation=1.0, adapt_until=0
-    )
-    goal = plain.history[-1].objective * (1 + 1e-6)
-    result = tc.reconstruct(recording, tc.AdmmTV(iterations=150, tolerance=0.0))
-    reached = (p.iteration for p in result.history if p.objective <= goal)
-    assert next(reached, np.inf) <= most

@@ -22,7 +22,7 @@ import scipy.sparse
 from reconstruction import dense, scenes
 
 import thincam_jax as tc
-from helpers import compilations, finite_difference, quick, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -216,53 +216,3 @@ def test_implicit_gradients_of_a_dense_operator():
         slope = sum(np.vdot(s, d) for s, d in zip(slopes, direction, strict=True))
         change = finite_difference(lambda x: both(x)[0], at, direction, 1e-4)
         assert float(slope) == pytest.approx(float(change), rel=1e-4)
-
-
-@pytest.mark.thorough
-def test_batches_and_planes():
-    """A batch is its elements; an operator on (plane, y, x) has its planes in the image."""
-    rng = np.random.default_rng(3)
-    operator = Separable(rng.normal(size=(13, 9)), rng.normal(size=(17, 12)))
-    images = jnp.asarray(np.stack([scenes.blocks(FIELD, seed=n) for n in range(6)]))
-    captures = operator(images.reshape(2, 3, *FIELD))
-    solver = tc.AdmmTV(iterations=400, tolerance=1e-6)
-    both = tc.reconstruct(tc.Recording(captures, operator, noise_variance=1e-6), solver)
-    assert both.image.shape == (2, 3, *FIELD)
-    alone = tc.reconstruct(tc.Recording(captures[1, 2], operator, noise_variance=1e-6), solver)
-    assert relative_l2(both.image[1, 2], alone.image) < 1e-3
-    assert relative_l2(both.image[1, 2], images[5]) < 1e-2
-
-    shape = (2, 5, 4)
-    matrix = Matrix(rng.normal(size=(60, 40)), shape, (60,))
-    truth = jnp.asarray(np.stack([scenes.blocks(shape[1:], seed=n) for n in range(2)]))
-    recording = tc.Recording(matrix(truth), matrix, noise_variance=1e-6)
-    found = tc.reconstruct(recording, tc.AdmmTV(iterations=300))
-    assert found.image.shape == shape and relative_l2(found.image, truth) < 1e-2
-
-
-@pytest.mark.thorough
-def test_captures_in_any_units_and_single_precision():
-    """Captures times a number: the image times that number."""
-    given = case("separable")
-    operator = jax.tree.map(lambda x: x.astype(jnp.float32), operators()["separable"])
-    capture = given.recording.captures[0].astype(jnp.float32)
-    plain = tc.reconstruct(tc.Recording(capture, operator), tc.AdmmTV(iterations=40))
-    assert plain.image.dtype == jnp.float32
-    for factor in (1e-8, 1e8):
-        scaled = tc.Recording(jnp.float32(factor) * capture, operator)
-        other = tc.reconstruct(scaled, tc.AdmmTV(iterations=40))
-        assert relative_l2(other.image / factor, plain.image) < 1e-3
-
-
-@pytest.mark.parametrize("name", quick(["small", "sparse", "separable", "dense"], 0))
-def test_new_values_compile_nothing(name):
-    """Other captures, variances, τ and tolerances of one shape run the programs that are there.
-
-    Those of the factorisations and of conjugate gradients among them.
-    """
-    given = case(name).recording
-    captures, variances = [3 * c for c in given.captures], [2 * v for v in given.noise_variance]
-    other = tc.Recording(captures, given.imaging_model, noise_variance=variances)
-    tc.reconstruct(given, tc.AdmmTV(TAU, iterations=20))
-    again = tc.AdmmTV(0.5 * TAU, iterations=20, tolerance=1e-5)
-    assert compilations(lambda: tc.reconstruct(other, again)) == 0

@@ -13,7 +13,7 @@ from thincam_jax._core.grids import block_mean, block_sum
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.targets import resize
 from thincam_jax.reconstruction import InverseProblem
-from thincam_jax.reconstruction.coarse import coarser, finer
+from thincam_jax.reconstruction.coarse import coarser
 
 SENSOR, FIELD = (98, 121), (103, 110)
 RNG = np.random.default_rng(0)
@@ -66,13 +66,6 @@ def test_what_is_too_small_or_no_convolution_has_none():
     matrix = tc.imaging.operators.Matrix(jnp.asarray(RNG.random((9, 12))), (3, 4), (9,))
     plain = InverseProblem([matrix], [RNG.random((1, 9))])
     assert coarser(plain, jnp.zeros(plain.image_shape)) is None
-
-
-def test_a_finer_image_keeps_a_ramp():
-    ramp = jnp.arange(6.0)[:, None] + jnp.zeros((1, 5))
-    fine = finer(ramp[None, None], (11, 9))
-    assert fine.shape == (1, 1, 11, 9)
-    np.testing.assert_allclose(fine[0, 0, 1:-1, 4], np.arange(1, 10) / 2 - 0.25)
 
 
 @pytest.mark.thorough

@@ -9,7 +9,7 @@ import pytest
 from reconstruction import rig
 
 import thincam_jax as tc
-from helpers import count_traces, quick, relative_l2
+from helpers import quick, relative_l2
 from thincam_jax.units import nm, um
 
 
@@ -93,41 +93,6 @@ def test_batches_equal_one_by_one_and_intensities_scale():
     assert whole.image.shape == (3, *rig.FIELD)
     assert relative_l2(whole.image[1], method(taken[:, 1]).image) < 1e-12
     assert relative_l2(method(1e-6 * taken[:, 2]).image, 1e-6 * whole.image[2]) < 1e-12
-
-
-def test_the_field_is_cut_from_the_middle():
-    """Another field shows the same image, more or less of it; it may be larger than the sensor."""
-    cameras = rig.phases(beta=50.0)
-    taken = rig.captures(cameras, rig.picture())
-    small = scanning(cameras)(taken).image
-    large = np.asarray(scanning(cameras, field_shape=(110, 51))(taken).image)
-    assert relative_l2(large[35:75, 2:49], small) < 0.05
-    np.testing.assert_array_equal(scanning(cameras, field_shape=(39, 46))(taken).image, small)
-
-
-def test_not_traced_again_for_other_captures_and_cameras(monkeypatch):
-    counted = count_traces(jnp.roll)
-    monkeypatch.setattr("jax.numpy.roll", counted)
-    shape = (38, 45)  # of no other test: compiled here
-    first, second = rig.phases(beta=50.0), rig.phases(beta=47.0)
-    taken = rig.captures(first, rig.picture())
-    results = [
-        scanning(cameras, field_shape=shape)(gain * taken).image
-        for cameras in (first, second)
-        for gain in (1.0, 2.0)
-    ]
-    assert counted.traces == 1
-    assert relative_l2(results[1], 2 * results[0]) < 1e-12
-    assert relative_l2(results[2], results[0]) > 0.01
-
-
-def test_captures_in_any_order():
-    cameras = rig.phases(beta=50.0)
-    taken = rig.captures(cameras, rig.picture())
-    expected = scanning(cameras)(taken).image
-    order = np.array([2, 0, 3, 1])
-    value = scanning([cameras[k] for k in order])(taken[order])
-    np.testing.assert_allclose(value.image, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import lineax as lx
 import numpy as np
 import pytest
 from reconstruction import scenes
-from reconstruction.test_admm import case, solved
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, relative_l2
@@ -23,7 +22,6 @@ from thincam_jax.reconstruction.implicit_gradient import (
     implicit_proximal_gradient,
     solve_fixed_point,
 )
-from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.regularisers import Cosines, Sparsity
 from thincam_jax.reconstruction.splittings import splitting_of
 from thincam_jax.units import nm
@@ -142,37 +140,6 @@ def test_the_gradient_of_a_psnr_by_differences(name):
 
 
 @pytest.mark.thorough
-def test_new_values_compile_nothing():
-    _, gradient, counted = compiled()
-    for factor in (1.0, 1.01):
-        slopes = gradient(jax.tree.map(lambda x, f=factor: f * x, parameters()))
-    assert counted.traces == 1
-    assert all(bool(jnp.isfinite(s).all()) for s in jax.tree.leaves(slopes))
-
-
-def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
-    result = solve_fixed_point(
-        splitting_of(problem).with_penalties(tuned(problem, factor)),
-        jnp.zeros(problem.image_shape),
-        iterations=iterations,
-        tolerance=tolerance,
-        relaxation=1.8,
-    )
-    return result.image, result.iterations, result.converged
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["planes", "colour", "two"])
-def test_it_is_the_minimiser_of_the_iteration_in_chunks(name):
-    given = case(name)
-    image, iterations, converged = settled(given.problem)
-    assert bool(converged) and 50 < int(iterations) < 3000
-    assert relative_l2(image, solved(given.problem, iterations=3000)) < 1e-6
-    cut_short = settled(given.problem, iterations=7)
-    assert int(cut_short[1]) == 7 and not bool(cut_short[2])
-
-
-@pytest.mark.thorough
 def test_a_batch_of_captures_by_vmap():
     """Values and gradients are those of each capture alone."""
     problem, _ = scenes.problem(captures=1, tau=0.05)
@@ -255,23 +222,6 @@ def test_the_series_solves_linear_systems():
     np.testing.assert_array_equal(none.value, 0.0)
 
 
-@pytest.mark.thorough
-def test_single_precision_has_a_gradient():
-    """Finite, and that of double precision to a few per cent."""
-    problem, _ = scenes.problem(captures=1, tau=0.05)
-
-    def total(tau, problem):
-        other = eqx.tree_at(lambda p: p.tau, problem, tau)
-        first = jnp.zeros(other.image_shape, other.tau.dtype)
-        result = solve_fixed_point(other, first, iterations=200, tolerance=1e-7, relaxation=1.8)
-        return jnp.sum(result.image**2)
-
-    small = scenes.single(problem)
-    value = jax.grad(total)(small.tau, small)
-    assert value.dtype == jnp.float32
-    assert float(value) == pytest.approx(float(jax.grad(total)(problem.tau, problem)), rel=0.03)
-
-
 def zeros(problem):
     return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
 
@@ -286,14 +236,6 @@ def sparse(tau):
         nonnegative=False,
         regulariser=Sparsity(Cosines()),
     )
-
-
-@pytest.mark.thorough
-def test_with_a_proximal_map_in_closed_form_it_is_the_minimum_of_fista():
-    problem, _ = sparse(0.05)
-    own = solve_fista(problem, iterations=800, tolerance=1e-10)
-    image = implicit_proximal_gradient(problem, zeros(problem), iterations=2000, tolerance=1e-12)
-    assert relative_l2(image, own.image) < 1e-6
 
 
 @pytest.mark.thorough

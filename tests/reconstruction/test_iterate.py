@@ -72,11 +72,6 @@ def test_it_runs_to_the_last_iteration_and_keeps_the_best():
     assert (third.primal, third.dual) == pytest.approx((1e-6, 1e-5))
 
 
-def test_the_first_image_is_kept_if_none_is_better():
-    outcome = run([0, *[200] * 9], iterations=9)
-    np.testing.assert_array_equal(outcome.image, 100.0)
-
-
 def test_it_counts_on_from_a_run_before():
     """Of nine iterations four are done already."""
     outcome = iterate(
@@ -102,12 +97,6 @@ def test_it_stops_when_both_residuals_are_small():
     for tolerance, expected in ((1.01e-5, 6), (0.99e-5, 9)):
         outcome = run(np.zeros(20), iterations=15, tolerance=tolerance)
         assert (outcome.status, outcome.iterations) == ("converged", expected)
-
-
-def test_a_callback_stops_it():
-    outcome = run(np.arange(30.0)[::-1], iterations=20, callback=lambda p: p.iteration >= 6)
-    assert (outcome.status, outcome.iterations) == ("stopped", 6)
-    assert float(outcome.image.squeeze()) == 23
 
 
 def test_an_interruption_keeps_the_best_image():

@@ -7,7 +7,6 @@ import pytest
 import scipy.ndimage
 
 import thincam_jax as tc
-from helpers import count_traces
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.reconstruction.noise import estimate_noise, estimate_variance
 
@@ -88,40 +87,6 @@ def test_what_is_even_has_none_and_a_ramp_of_counts_that_of_rounding():
         assert float(estimate_noise(jnp.asarray(image))) == 0.0
     for image in (2 * y - 5 * x, y**2 + np.abs(x - 4)):
         assert float(estimate_noise(jnp.asarray(image))) == pytest.approx(1 / 12**0.5)
-
-
-def test_saturated_pixels_do_not_count():
-    counts, true = disc_capture(0.0, 400, 8, 0, 11)
-    full = np.minimum(counts, 255)
-    assert 0.1 < np.mean(full == 255) < 0.5
-    found = float(compiled(jnp.asarray(full, jnp.float32)))
-    assert 0.5 * true < found < true  # of what is darker
-
-
-@pytest.mark.parametrize("factor", [1e-12, 1e12])
-def test_it_scales(factor):
-    noise = jnp.asarray(RNG.normal(size=(40, 31)), jnp.float32)
-    scaled = estimate_noise(noise * jnp.float32(factor))
-    assert scaled.dtype == jnp.float32
-    assert float(scaled) == pytest.approx(factor * float(estimate_noise(noise)), rel=1e-6)
-
-
-def test_images_too_small_have_none():
-    for shape in ((1, 9), (9, 1), (3, 1, 1)):
-        value = estimate_noise(jnp.ones(shape))
-        np.testing.assert_array_equal(value, np.zeros(shape[:-2]))
-
-
-@pytest.mark.thorough
-def test_batches_and_compilation():
-    images = jnp.asarray(RNG.normal(size=(2, 3, 20, 21)) * np.arange(1, 7).reshape(2, 3, 1, 1))
-    counted = count_traces(estimate_noise)
-    compiled = jax.jit(counted)
-    values = compiled(images)
-    np.testing.assert_allclose(compiled(2 * images), 2 * values)
-    assert counted.traces == 1
-    np.testing.assert_allclose(jax.vmap(jax.vmap(estimate_noise))(images), values)
-    np.testing.assert_allclose(values[1, 2], estimate_noise(images[1, 2]))
 
 
 @pytest.mark.thorough

@@ -9,7 +9,6 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.reconstruction.depth import refocus_sweep
 from thincam_jax.reconstruction.outside_light import covering, outside_light, pinned, with_field
 from thincam_jax.units import nm, um
 
@@ -77,42 +76,26 @@ def test_the_field_covers_the_scene_by_default(solver):
 
 
 @pytest.mark.thorough
-def test_counts_of_a_scene_beyond_the_sensors_field():
-    plane, recording = seen(1.25, snr=100.0)
-    light: Any = recording.captures[0]
-    electrons = np.random.default_rng(2).poisson(np.clip(light / light.mean() * 3000, 0, None))
-    counts = dataclasses.replace(recording, captures=[electrons.astype(float)])
-    result: Any = tc.reconstruct(counts, tc.PoissonTV())
-    assert "the image has field_shape=" + str(result.image.shape) in result.reason
-    again: Any = tc.reconstruct(counts, tc.PoissonTV(iterations=20), start=result.image)
-    assert again.image.shape == result.image.shape
-    kept: Any = tc.reconstruct(with_field(counts, SHAPE), tc.PoissonTV())
-    assert likeness(result, plane, SHAPE) > likeness(kept, plane) + 0.02
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize("snr", [20.0, 40.0])
 @pytest.mark.parametrize("shading", [0.0, 0.2])
 def test_scenes_inside_have_none(snr, shading):
     """Nor does shading make some: what explains it outside is haze."""
     for size, field in ((0.7, {}), (0.8, {"field_width": 0.8 * SHAPE[1] * PITCH * FAR / DISTANCE})):
-        result = tc.reconstruct(seen(size, snr, shading, **field)[1], tc.AdmmTV())
-        assert "outside of" not in result.reason
-        assert result.image.shape[0] == SHAPE[0]
+        recording = seen(size, snr, shading, **field)[1]
+        for solver in (tc.AdmmTV(), tc.Ridge()):
+            result = tc.reconstruct(recording, solver)
+            assert "outside of" not in result.reason
+            assert result.image.shape[0] == SHAPE[0]
 
 
 @pytest.mark.thorough
-def test_the_choice_of_a_solver_keeps_what_was_noticed():
-    reason = tc.reconstruct(seen(1.0, field_shape=(44, 52))[1]).reason
-    assert "PlugAndPlay" in reason and "give field_shape=" in reason
-
-
-@pytest.mark.thorough
-def test_a_sweep_keeps_the_shape_of_its_images():
-    """At wrong distances light seems to come from elsewhere."""
-    _, recording = seen(1.25)
-    sweep = refocus_sweep(recording, [150.0, FAR, 500.0], tc.AdmmTV(1.0, iterations=100))
-    assert np.shape(sweep.images) == (3, *SHAPE)
+def test_ridge_finds_it_too():
+    plane, recording = seen(1.25)
+    result: Any = tc.reconstruct(recording, tc.Ridge())
+    assert "the image has field_shape=" + str(result.image.shape) in result.reason
+    kept: Any = tc.reconstruct(with_field(recording, SHAPE), tc.Ridge())
+    assert "give field_shape=" in kept.reason
+    assert likeness(result, plane, SHAPE) > likeness(kept, plane) + 0.1
 
 
 def test_other_models_and_starts_are_as_before():

@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reconstruction import rig, scenes
+from reconstruction import scenes
 
-import thincam_jax as tc
 from helpers import quick, relative_l2
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import (
@@ -63,17 +62,6 @@ def test_the_objective_of_the_parts_is_that_of_the_whole(coupling, count):
 
 
 @pytest.mark.thorough
-def test_one_psf_for_all_colours_and_weights_that_broadcast():
-    problem, _ = scenes.problem(batch=(2,), channels=3)
-    shared = [jax.tree.map(lambda s: s[:1], o) for o in problem.operators]
-    row = jnp.linspace(0.5, 1.5, problem.captures[0].shape[-1])
-    whole = scenes.inverse(shared, problem.captures, tau=0.1, weights=[row, 2.0])
-    image = jnp.asarray(np.random.default_rng(1).uniform(size=whole.image_shape))
-    parallel = ParallelMethod(whole, admm)
-    np.testing.assert_allclose(parallel.objective(image), objective(whole, image), rtol=1e-12)
-
-
-@pytest.mark.thorough
 def test_the_minimum_is_that_of_the_whole_and_of_each_part_alone():
     problem, _ = scenes.problem(batch=(2,), channels=2, kernel=scenes.spots, tau=3e-3)
     problem = masked(problem)
@@ -100,23 +88,6 @@ def test_the_worst_part_counts():
     assert len({r.primal for r in found.elements}) == 2
 
 
-@pytest.mark.thorough
-def test_units_and_penalties_do_not_depend_on_the_batch():
-    """Through the entry point: the same captures alone and beside a bright one."""
-    cameras = rig.pair()
-    captures = rig.captures(cameras, rig.picture())
-    model = tc.Cameras(cameras, object_distance=rig.OBJECT_DISTANCE, wavelength=rig.WAVELENGTH)
-    solver = tc.AdmmTV(iterations=30, tolerance=0.0)
-    alone, both = (
-        tc.reconstruct(tc.Recording(given, model, noise_variance=1e-12), solver)
-        for given in (
-            captures[:, None],
-            jnp.stack([captures, 1e3 * captures[..., ::-1]], axis=1)[:, :, None],
-        )
-    )
-    np.testing.assert_allclose(both.image[0], alone.image, rtol=1e-10, atol=1e-12)
-
-
 def test_only_independent_parts_run_in_parallel():
     coupled = TotalVariation(coupling="joint")
     assert parallel_pays(scenes.problem(batch=(2,))[0])
@@ -133,14 +104,6 @@ def test_precision_of_the_calling_thread():
     assert threading.get_ident() not in {thread for _, thread in found}
 
 
-def test_other_settings_of_the_calling_thread():
-    with jax.debug_nans(True), pytest.raises(FloatingPointError):
-        _in_threads(lambda x: jax.block_until_ready(jnp.log(jnp.asarray(x))), [-1.0, -2.0])
-    with jax.numpy_dtype_promotion("standard"):
-        mixed = _in_threads(lambda x: jnp.asarray(x, "float32") + jnp.ones(2), [1.0, 2.0])
-    assert all(m.dtype == jnp.float64 for m in mixed)
-
-
 def test_operators_are_not_copied():
     """Every part refers to the same spectrum, however many images there are."""
     problem, _ = scenes.problem(batch=(5,))
@@ -150,11 +113,3 @@ def test_operators_are_not_copied():
         assert {s.unsafe_buffer_pointer() for s in spectra} == {
             problem.operators[n].spectrum.unsafe_buffer_pointer()
         }
-
-
-def test_an_error_of_a_part_is_not_lost():
-    def fail(number):
-        raise ValueError(f"part {number}")
-
-    with pytest.raises(ValueError, match="part 0"):
-        _in_threads(fail, [0, 1, 2])

@@ -148,22 +148,6 @@ def test_stacks_masks_and_gains_are_resolved():
     assert float(jax.jit(total_misfit)(image, whole)) == pytest.approx(expected, rel=1e-12)
 
 
-def test_counts_and_single_precision():
-    """Raw counts become real numbers; τ and weights take the captures' precision."""
-    counts = RNG.integers(0, 4000, size=(1, *SENSORS[0]))
-    kernel = RNG.uniform(size=(1, 1, *kernel_shape(SENSORS[0], FIELD)))
-    whole = InverseProblem([operator(kernel, SENSORS[0])], [counts], tau=0.7)
-    assert whole.captures[0].dtype == jnp.float64 and float(whole.tau) == 0.7
-    single = InverseProblem(
-        [operator(kernel.astype(np.float32), SENSORS[0])],
-        [jnp.asarray(counts, jnp.float32)],
-        tau=0.7,
-    )
-    assert single.tau.dtype == jnp.float32 and single.weights[0].dtype == jnp.float32
-    image = jnp.ones(single.image_shape, jnp.float32)
-    assert objective(single, image).dtype == jnp.float32
-
-
 def test_what_is_refused():
     kernel = RNG.uniform(size=(1, 1, *kernel_shape(SENSORS[0], FIELD)))
     first = operator(kernel, SENSORS[0])
@@ -231,11 +215,6 @@ def test_objectives_differ_by_a_factor_only_and_the_gradient_is_that_of_the_misf
     np.testing.assert_allclose(gradient(inside, truth), wanted, rtol=1e-9, atol=1e-9)
 
 
-def test_all_that_is_seen_has_its_transpose():
-    problem, _ = scenes.problem(planes=2, weights=[0.3, jnp.linspace(0, 1, 29)])
-    assert adjoint_error(WeightedOperator(problem), jax.random.key(1), dtype=jnp.float64) < 1e-13
-
-
 @pytest.mark.parametrize("factor", [1e-12, 1e12])
 def test_no_unit_is_too_large_or_too_small_for_float32(factor):
     plain = ScaledProblem(scenes.single(scenes.problem()[0]))
@@ -249,3 +228,8 @@ def test_a_start_of_another_shape_is_refused():
     problem, _ = scenes.problem()
     with pytest.raises(ValueError, match="start image has shape"):
         start_image(problem, jnp.zeros((3, 4)))
+
+
+def test_all_that_is_seen_has_its_transpose():
+    problem, _ = scenes.problem(planes=2, weights=[0.3, jnp.linspace(0, 1, 29)])
+    assert adjoint_error(WeightedOperator(problem), jax.random.key(1), dtype=jnp.float64) < 1e-13

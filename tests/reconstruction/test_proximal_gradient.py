@@ -88,28 +88,6 @@ def test_restart_reaches_in_70_iterations_what_takes_more_than_140_without():
 
 
 @pytest.mark.thorough
-def test_optimistix_in_one_loop_gives_the_image_of_steps_from_outside():
-    problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
-    own = solve_fista(problem, image=zeros(problem), iterations=60, tolerance=0.0)
-    method = FistaMethod(problem)
-    loop = optimistix.minimise(
-        total_misfit,
-        method.solver,
-        zeros(problem),
-        args=method.arguments,
-        max_steps=60,
-        throw=False,
-    )
-    assert int(loop.stats["num_steps"]) == 60 and own.status == "iterations_exhausted"
-    np.testing.assert_allclose(method.image_of(loop.value), own.image, atol=1e-10)
-    solver = AcceleratedProximalGradient(method.solver.proximal, 1e-4)
-    ended = optimistix.minimise(total_misfit, solver, zeros(problem), args=method.arguments)
-    assert solve_fista(problem, image=zeros(problem), tolerance=1e-4).status == "converged"
-    near = method.image_of(ended.value)
-    assert relative_l2(near, own.image) < 0.1
-
-
-@pytest.mark.thorough
 def test_optimistix_drives_the_minimiser_and_differentiates_through_it():
     """dE*/dτ = R(f*), the envelope theorem, by the derivative of the solution."""
     regulariser = Sparsity(Wavelet("haar", 2))

@@ -11,7 +11,7 @@ from reconstruction import rig
 from scipy import signal
 
 import thincam_jax as tc
-from helpers import quick, relative_l2
+from helpers import quick
 from thincam_jax.imaging.operators import CropConvolution, Masked, Matrix, Separable, Stacked
 from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.reconstruction import InverseProblem
@@ -151,14 +151,6 @@ def test_planes_at_several_distances():
     )
 
 
-def test_the_field_takes_the_parity_of_the_sensor():
-    seen = rig.captures(cameras(), rig.picture(FIELD))
-    problem = camera_problem(seen, cameras(), field_shape=(27, 33))
-    assert problem.field_shape == (28, 33)
-    whole = camera_problem(seen, cameras(), field_shape=None)
-    assert whole.field_shape == SENSOR.shape
-
-
 @pytest.mark.parametrize(
     ("kernel", "sensor"),
     quick(
@@ -246,41 +238,6 @@ def test_tau_is_the_noise_of_the_back_projection():
     assert float(value) == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("factor", quick([1e-8, 1e8], 0))
-def test_problems_scale_with_their_captures(factor):
-    """Noise estimated, single precision: weights fall and τ falls so that the image scales."""
-    seen = RNG.uniform(size=(2, 20, 23)).astype(np.float32)
-    psfs = RNG.uniform(size=(2, 7, 6)).astype(np.float32)
-    one, other = psf_problem(seen, psfs), psf_problem(seen * np.float32(factor), psfs)
-    np.testing.assert_allclose(other.absolute_tau, one.absolute_tau / factor, rtol=1e-5)
-    for a, b in zip(one.weights, other.weights, strict=True):
-        assert b.dtype == jnp.float32
-        np.testing.assert_allclose(b, a / factor**2, rtol=1e-5)
-
-
-def test_captures_without_noise_scale_too():
-    """A shadow on a dark ground has none: a thousandth of its root mean square is assumed."""
-    seen = np.zeros((1, 20, 23))
-    seen[0, 8:12, 9:14] = 3.0
-    one, other = (psf_problem(f * seen, np.ones((1, 3, 3))) for f in (1.0, 1e-6))
-    np.testing.assert_allclose(1 / one.weights[0], 1e-6 * np.mean(seen**2), rtol=1e-9)
-    np.testing.assert_allclose(other.absolute_tau, 1e6 * one.absolute_tau, rtol=1e-9)
-    given = psf_problem(seen, np.ones((1, 3, 3)), noise_variance=0.0)
-    np.testing.assert_allclose(given.weights[0], one.weights[0])
-    dark = psf_problem(np.zeros((1, 20, 23)), np.ones((1, 3, 3)))
-    np.testing.assert_array_equal(dark.weights[0], 1.0)
-
-
-def test_single_precision_captures_make_single_precision_problems():
-    seen = rig.captures(cameras(), rig.picture(FIELD))
-    double = camera_problem(seen, cameras(), noise_variance=1e-6)
-    single = camera_problem(seen.astype(jnp.float32), cameras(), noise_variance=1e-6)
-    assert single.absolute_tau.dtype == jnp.float32
-    assert single.operators[0].spectrum.dtype == jnp.complex64
-    value = np.asarray(single.operators[0].spectrum).astype(complex)
-    assert relative_l2(value, double.operators[0].spectrum) < 1e-5
-
-
 @pytest.mark.parametrize("shape", [(), (61,), (52, 61), (1, 52, 61), (2, 52, 61), (2, 1, 52, 61)])
 def test_masks_of_any_shape_that_fits_say_the_same(shape):
     """One for all captures or one for each; of a grey capture, or of each of its colours."""
@@ -294,17 +251,6 @@ def test_masks_of_any_shape_that_fits_say_the_same(shape):
     expected[..., 30] = not shape
     for weight in problem.weights:
         np.testing.assert_allclose(weight, 2.0 * expected)
-
-
-def test_masks_of_single_captures():
-    """A list of them; they need not be of one shape."""
-    seen = RNG.uniform(size=(2, 3, *SENSOR.shape))
-    dead = np.ones(SENSOR.shape, bool)
-    dead[7] = False
-    problem = psf_problem(seen, np.ones((2, 4, 5)), valid=[True, dead], noise_variance=1.0)
-    whole = np.ones((3, *SENSOR.shape))
-    np.testing.assert_array_equal(problem.weights[0], whole)
-    np.testing.assert_array_equal(problem.weights[1], whole * dead)
 
 
 def matrix(pixels, seed=3):
@@ -492,6 +438,19 @@ def test_captures_that_are_known_inside_jit_are_checked_there():
     holed = jnp.asarray(ENDLESS[0])
     with pytest.raises(ValueError, match=r"captures\[0\] holds NaN"):
         jax.jit(lambda psf: tc.Recording([holed], tc.Psfs(psf[None])).problem())(psf)
+
+
+def test_captures_without_noise_scale_too():
+    """A shadow on a dark ground has none: a thousandth of its root mean square is assumed."""
+    seen = np.zeros((1, 20, 23))
+    seen[0, 8:12, 9:14] = 3.0
+    one, other = (psf_problem(f * seen, np.ones((1, 3, 3))) for f in (1.0, 1e-6))
+    np.testing.assert_allclose(1 / one.weights[0], 1e-6 * np.mean(seen**2), rtol=1e-9)
+    np.testing.assert_allclose(other.absolute_tau, 1e6 * one.absolute_tau, rtol=1e-9)
+    given = psf_problem(seen, np.ones((1, 3, 3)), noise_variance=0.0)
+    np.testing.assert_allclose(given.weights[0], one.weights[0])
+    dark = psf_problem(np.zeros((1, 20, 23)), np.ones((1, 3, 3)))
+    np.testing.assert_array_equal(dark.weights[0], 1.0)
 
 
 def test_iterative_solvers_say_what_works_under_jit():

@@ -50,11 +50,6 @@ def kernels(channels=1, planes=1, phase=0.0):
     return np.reshape(stack, (channels, planes, *SHAPE))
 
 
-def fringes(channels=1, planes=1):
-    """The same without uniform light."""
-    return kernels(channels, planes) - kernels(channels, planes, phase=math.pi)
-
-
 def noisy_problem(*responses, batch=(), channels=1, weights=None):
     """Captures that no image explains, through each of the kernels given."""
     rng = np.random.default_rng(8)
@@ -155,24 +150,6 @@ def test_whole_windows_against_a_loop(length):
     assert 0 < wanted.sum() < trusted.sum()
 
 
-def test_cameras_without_bias_are_left_alone(monkeypatch):
-    """Fringes alone, and a small aperture."""
-    assert without_uniform_light(noisy_problem(kernels())) is None  # 24 pixels
-    monkeypatch.setattr(uniform_light, "_BIASED", 5.0)
-    assert without_uniform_light(noisy_problem(fringes())) is None
-    assert without_uniform_light(noisy_problem(kernels())) is not None
-
-
-@pytest.mark.usefixtures("low_bar")
-def test_only_the_biased_captures_are_filtered():
-    problem = noisy_problem(kernels(), fringes())
-    easier = without_uniform_light(problem)
-    assert not np.allclose(easier.captures[0], problem.captures[0])
-    np.testing.assert_array_equal(easier.captures[1], problem.captures[1])
-    np.testing.assert_array_equal(easier.operators[1].spectrum, problem.operators[1].spectrum)
-    np.testing.assert_array_equal(easier.weights[1], problem.weights[1])
-
-
 @pytest.mark.usefixtures("low_bar")
 def test_too_few_pixels():
     """A sensor of 31 pixels has no window of 5, and scattered dead pixels leave no window whole."""
@@ -215,14 +192,6 @@ def test_the_level_is_found_again(planes, channels, batch):
     problem = scenes.inverse(operators, captures, tau=1e-3, weights=[mask, 3.0])
     lost = jnp.asarray(rng.uniform(-0.5, 0.5, (*batch, channels, 1, 1, 1)))
     np.testing.assert_allclose(with_uniform_light(problem, image - lost), image, rtol=1e-10)
-
-
-def test_nothing_negative_remains_where_that_is_asked():
-    operator = scenes.convolution()
-    image = jnp.asarray(np.random.default_rng(6).uniform(-1, 1, (1, 1, *scenes.FIELD)))
-    for asked in (True, False):
-        problem = scenes.inverse([operator], [operator(image)], tau=1e-3, nonnegative=asked)
-        assert (jnp.min(with_uniform_light(problem, image)) >= 0) == asked
 
 
 def wide(shape=WIDE):
@@ -274,18 +243,6 @@ def test_the_start_is_worth_its_iterations(wide_capture, monkeypatch):
 
 
 @pytest.mark.thorough
-def test_the_history_is_that_of_one_run(wide_capture):
-    """The callback sees it; the objective is the whole problem's all along."""
-    progress = []
-    result = solve(wide_capture, callback=progress.append)
-    assert [p.iteration for p in result.history] == list(range(0, 61, 10))
-    assert progress == list(result.history[1:])
-    assert result.iterations == 60 and result.status == "iterations_exhausted"
-    objectives = [p.objective for p in result.history]
-    assert objectives[0] > objectives[1] > objectives[2] > 3 * objectives[3]
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize("ending", ["stopped", "interrupted"])
 def test_it_can_end_in_the_first_part(wide_capture, ending):
     """With the image so far, levelled: its objective is the last of the history."""
@@ -309,45 +266,3 @@ def test_it_can_end_in_the_first_part(wide_capture, ending):
     assert [p.iteration for p in result.history] == [0, 10, 20]
     np.testing.assert_array_equal(result.image, images[-1][:, 0, ::-1, ::-1])
     assert float(objective(problems[-1], images[-1])) == pytest.approx(result.history[-1].objective)
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("low_bar")
-def test_a_first_part_that_converges_leaves_more_to_the_second(monkeypatch):
-    """Such a tolerance is met at the first check of both; Ctrl-C between them keeps the image."""
-    capture = wide(SENSOR)
-    result = solve(capture, tolerance=10.0)
-    assert [p.iteration for p in result.history] == [0, 10, 20]
-    assert (result.status, result.iterations) == ("converged", 20)
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(tc.AdmmTV, "_by_admm", interrupt)
-    result = solve(capture)
-    assert (result.status, result.iterations) == ("interrupted", 20)
-
-
-@pytest.mark.thorough
-def test_what_has_no_first_part(wide_capture, monkeypatch):
-    """Few iterations, a start that is given, and other methods; none is longer than asked."""
-    asked = []
-    monkeypatch.setattr(uniform_light, "without_uniform_light", asked.append)
-    for iterations in (1, 10):
-        assert solve(wide_capture, iterations=iterations).iterations == iterations
-    solve(wide_capture, iterations=20, start=jnp.ones(WIDE))
-    assert not asked
-    solve(wide_capture, iterations=20)
-    assert len(asked) == 1
-
-
-@pytest.mark.thorough
-def test_a_batch_is_iterated_in_parallel(wide_capture):
-    """Each of its images as if it stood elsewhere."""
-    camera, image, variance, valid = wide_capture
-    images = jnp.stack([image, 3 * image[..., ::-1, :]], axis=1)
-    masks = np.stack([valid, np.ones_like(valid)], axis=1)
-    result = solve((camera, images, variance, masks), iterations=20)
-    assert [p.iteration for p in result.history] == [0, 10, 20]
-    turned = solve((camera, images[:, ::-1], variance, masks[:, ::-1]), iterations=20)
-    np.testing.assert_allclose(turned.image[::-1], result.image, rtol=1e-9, atol=1e-12)

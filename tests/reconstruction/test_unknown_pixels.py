@@ -9,7 +9,6 @@ import pytest
 import scipy.signal
 
 import thincam_jax as tc
-from thincam_jax._core import checks
 
 RNG = np.random.default_rng(0)
 PSFS = tc.Psfs(RNG.random((2, 5, 7)))
@@ -84,22 +83,6 @@ def test_captures_of_other_makes(kind):
     assert np.isfinite(tc.reconstruct(found, tc.Ridge(0.1)).image).all()
 
 
-def test_arrays_of_other_libraries():
-    dask = pytest.importorskip("dask.array")
-    found = tc.Recording(dask.from_array(CAPTURES), PSFS)
-    np.testing.assert_array_equal(np.stack(found.captures), CAPTURES)
-    np.testing.assert_array_equal(checks.native(ByDlpack(CAPTURES)), CAPTURES)
-
-
-def test_checked_functions_convert_them_too():
-    from thincam_jax.measured.bayer import demosaic
-
-    mosaic = CAPTURES[0]
-    expected = demosaic(mosaic, "RGGB")
-    for make in (ByArray, ByDlpack, lambda a: masked(a, False), lambda a: a.astype(">f4")):
-        np.testing.assert_allclose(demosaic(make(mosaic), "RGGB"), expected, rtol=1e-6)
-
-
 def test_traced_captures_pass():
     residual = jax.jit(lambda c: tc.Recording(c, PSFS, noise_variance=1.0).captures[0].sum())
     assert float(residual(jnp.asarray(CAPTURES))) == pytest.approx(CAPTURES[0].sum(), rel=1e-5)
@@ -128,3 +111,12 @@ def test_saturated_and_hot_pixels_are_found_by_default(caplog):
     given = tc.Recording(dirty, psfs, valid=~hot)
     np.testing.assert_array_equal(np.stack(given.valid or ()), [~hot] * 2)
     assert not caplog.records
+
+
+def test_checked_functions_convert_them_too():
+    from thincam_jax.measured.bayer import demosaic
+
+    mosaic = CAPTURES[0]
+    expected = demosaic(mosaic, "RGGB")
+    for make in (ByArray, ByDlpack, lambda a: masked(a, False), lambda a: a.astype(">f4")):
+        np.testing.assert_allclose(demosaic(make(mosaic), "RGGB"), expected, rtol=1e-6)

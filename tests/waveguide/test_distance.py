@@ -11,8 +11,13 @@ import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import um
-from thincam_jax.waveguide.distance import _judged, _search, find_distances_of
-from thincam_jax.waveguide.picture_likelihood import picture_likelihood, typical_variance
+from thincam_jax.waveguide.distance import (
+    _judged,
+    _search,
+    find_distances_of,
+    picture_likelihood,
+    typical_variance,
+)
 
 SHAPE, CELLS, ENDS = (44, 36), 90, (300.0, 1100.0)
 

@@ -64,16 +64,16 @@ def test_shrinkage_turns_and_shortens():
     assert after < before
 
 
-def test_refracted():
-    np.testing.assert_allclose(refracted(30 * deg, 1.0, 1.5), np.arcsin(1 / 3), rtol=1e-14)
-    with pytest.raises(ValueError, match="is totally reflected.*give a smaller angle"):
-        refracted(60 * deg, 1.5, 1.0)
-
-
 def test_glass():
     """BK7 at the lines of its data sheet."""
     lines = jnp.array([486.1327, 587.5618, 656.2725]) * nm
     np.testing.assert_allclose(bk7()(lines), [1.52238, 1.51680, 1.51432], atol=5e-6)
+
+
+def test_refracted():
+    np.testing.assert_allclose(refracted(30 * deg, 1.0, 1.5), np.arcsin(1 / 3), rtol=1e-14)
+    with pytest.raises(ValueError, match="is totally reflected.*give a smaller angle"):
+        refracted(60 * deg, 1.5, 1.0)
 
 
 def test_an_obtuse_angle_is_refused():

@@ -126,19 +126,6 @@ def test_colours_of_the_crop():
     assert (np.diff(rows) > 0).all()
 
 
-def test_places_are_rows_before_columns():
-    """As arrays are: a rectangle of 2 by 6 mm, and pixels that lie beside each other."""
-    wide = wg.Rectangle(centre=(5.0, 1.0), size=(2.0, 6.0))
-    np.testing.assert_array_equal(wide.holds(jnp.asarray([[4.5, 3.5], [3.5, 4.5]])), [True, False])
-    sts = camera()
-    row = pixel_centres(sts)[7, 20:23]
-    assert (np.ptp(row[:, 0]), np.ptp(row[:, 1])) == pytest.approx((0, 2 * float(sts.sensor.pitch)))
-    x, y, z = np.moveaxis(
-        np.asarray(wg.trace(sts, row, object_distance=550.0, orders=1).points[0]), -1, 0
-    )
-    assert np.all(np.diff(x) < -0.1) and np.ptp(y) < 0.1 and np.ptp(z) == 0
-
-
 def test_guided_range():
     """Along x₀ = 0 from −29.87° to 46.27° in air: critical angle and grazing (Eq 5.5)."""
     angles = np.radians(np.array([-29.88, -29.86, 46.26, 46.28]))

@@ -69,17 +69,6 @@ class TestGhostImages:
 class TestGhostsAlone:
     """Σ W_i e^{ijφ}: the transfer of ghosts an equal step apart."""
 
-    def test_decreasing_weights_have_no_zero(self):
-        """Eneström and Kakeya: Σ a_i z^i with a_0 > a_1 > … > 0 has its zeros outside |z| ≤ 1.
-
-        For |1 − z||p(z)| ≥ a_0 − Σ(a_{i−1} − a_i)|z|^i − a_n ≥ 0, with equality at z = 1 alone.
-        """
-        generator = np.random.default_rng(0)
-        for count in (2, 3, 5, 9):
-            weights = np.cumsum(generator.random(count) + 1e-3)[::-1]
-            assert (np.abs(np.roots(weights[::-1])) > 1).all()
-            assert np.abs(np.roots(weights)).max() < 1  # the reversed one: the test can fail
-
     def test_those_of_the_film(self):
         """W_i falls with i as 0 < 1 − η < 1, and |ΣW_i e^{ijφ}| ≥ ∫η²/(2 − η)dλ, its value at π.
 

@@ -86,21 +86,6 @@ def test_parts_of_the_band(number):
 
 
 @pytest.mark.thorough
-def test_the_bragg_wavelength_alone():
-    """A thick film of a narrow band smears nothing: the samples lie at the points of `trace`."""
-    pixels = jnp.asarray(PIXELS)
-    narrow = camera(hologram(thickness=16.0, index_modulation=2e-5))
-    narrow = eqx.tree_at(lambda c: c.tilt, narrow, jnp.array([0.03, -0.05]))
-    rays, band = (
-        wg.trace(narrow, pixels, object_distance=550.0, orders=2),
-        trace_band(narrow, pixels, 550.0, 2, 4),
-    )
-    np.testing.assert_allclose(band.weight, rays.weight, rtol=1e-2)
-    spread = np.abs(np.asarray(band.points) - np.asarray(rays.points)[..., None, 1::-1])
-    assert spread.max() < 0.02
-
-
-@pytest.mark.thorough
 def test_holograms_and_critical_angle_cut_the_band():
     """At its edge a hologram keeps a part of a contact's band, and the later contacts their own."""
     pixel = jnp.zeros((1, 2))

@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import wadler_lindig as wl
+from jaxtyping import PRNGKeyArray
 
 from thincam_jax._core.arguments import any_rank, refuse_unsound
+from thincam_jax._core.checks import shown
 from thincam_jax._core.quantity import Quantity, unchecked
 
 _MOST = 4  # numbers of an array that are shown, not counted
@@ -92,3 +94,16 @@ def _shown(converter: Any, value: Any) -> Any:
     if np.ndim(value) > 1 or np.size(value) > _MOST or not is_number:
         return value
     return wl.TextDoc(quantity.text(value))
+
+
+Key = PRNGKeyArray | int
+
+
+def random_key(key: Key) -> PRNGKeyArray:
+    """The key itself, or that of a seed, `jax.random.key(seed)`."""
+    if isinstance(key, int | np.integer) and not isinstance(key, bool) and 0 <= key < 2**64:
+        return jax.random.key(key)
+    if isinstance(key, jax.Array):
+        if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key) or key.dtype == "uint32":
+            return key
+    raise TypeError(f"key is {shown(key)}; give a seed, 0 or more, or jax.random.key(seed)")

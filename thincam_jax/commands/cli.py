@@ -15,11 +15,9 @@ from typer.core import TyperCommand, TyperGroup
 
 from thincam_jax._core.program_cache import cache_state, keep_programs
 from thincam_jax.commands import terminal
-from thincam_jax.commands.explain import explain, schema
-from thincam_jax.commands.explore import explore
 from thincam_jax.commands.kinds import commands_of_rooms, has_room, init, load_experiment
 from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
-from thincam_jax.commands.run import design, run
+from thincam_jax.commands.run import design, explain, explore, run, schema
 from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import reported, say, say_result
 

@@ -14,18 +14,19 @@ from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import Length, section
 from thincam_jax.imaging.targets.images import load_image
 from thincam_jax.lensless import masks
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.masks.cells import Combination, SeparableMask
 from thincam_jax.lensless.masks.display import on_display
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.masks.lenslets import LensletArray
-from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask
-from thincam_jax.lensless.masks.pinhole import Pinhole
-from thincam_jax.lensless.masks.redundant_arrays import ModifiedUniformlyRedundantArray
-from thincam_jax.lensless.masks.reliefs import diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask, diffuser, voronoi_fresnel
+from thincam_jax.lensless.masks.pinhole import LensletArray, Pinhole
+from thincam_jax.lensless.masks.redundant_arrays import (
+    Combination,
+    ModifiedUniformlyRedundantArray,
+    SeparableMask,
+)
 from thincam_jax.lensless.masks.sampled import SampledMask, read_mask
-from thincam_jax.lensless.propagation.path import LightPath
 
 APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 

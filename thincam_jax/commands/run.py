@@ -1,13 +1,16 @@
-"""The commands `thincam run` and `design`.
+"""The commands `thincam run`, `design`, `schema`, `explain` and `explore`.
 
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from thincam_jax._core.table import spelled
+from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment
 from thincam_jax.commands.terminal import (
     ConfigFile,
     DryRun,
@@ -46,9 +49,7 @@ def run(
         return f"interrupted; finished: {done}. The same command goes on from there."
 
     with reported(interrupted):
-        from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import ConfigError
-        from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.commands.run_folder import RunFolder
 
         if config.is_dir():
@@ -66,7 +67,7 @@ def run(
         outcome = folder.outcome(asked)
         warn(getattr(getattr(setup, "study", setup), "warnings", []))
         if dry_run:
-            explain.dry_run(asked, outcome, setup)
+            explain_run(asked, outcome, setup)
             return
         with counted(asked.name) as progress:
             found = kind.part(kind.run)(setup, folder, progress)
@@ -89,20 +90,136 @@ def design(
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with reported(lambda: goes_on):
-        from thincam_jax.commands import explain
         from thincam_jax.commands.design.build import build_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
-        from thincam_jax.commands.kinds import load_experiment
 
         wanted = load_experiment(config, tuple(set_ or ()), "design")
         study = build_design(wanted)
         warn(study.warnings)
         folder = DesignFolder.chosen(out, wanted.name, wanted)
         if dry_run:
-            explain.dry_run(wanted, folder.outcome(wanted))
+            explain_run(wanted, folder.outcome(wanted))
             return
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
     show(found.table())
     say(found.levels())
     say_result("report", folder.path / "report.html")
+
+
+def schema(
+    kind: Annotated[
+        str, typer.Argument(help=f"One of {', '.join(KINDS)}.", autocompletion=lambda: list(KINDS))
+    ],
+) -> None:
+    """Print the JSON Schema of a kind of experiment file, with which editors complete and check."""
+    with reported(lambda: "interrupted"):
+        import json
+
+        from thincam_jax.commands.config_file import ConfigError
+
+        if kind not in KINDS:
+            raise ConfigError(f"kind: {kind!r} is unknown; choose one of {', '.join(KINDS)}")
+        form = KINDS[kind].part(KINDS[kind].section).model_json_schema()
+    say(json.dumps(form, indent=2))
+
+
+def explain(config: ConfigFile, set_: Overrides = None) -> None:
+    """Print every value of an experiment file with its unit and where it comes from.
+
+    Also what a run computes: error, memory and operations of PSFs, rays of a screen, evaluations of
+    a search, frames of a capture, steps of a training.
+    """
+    with reported(lambda: "interrupted"):
+        asked = load_experiment(config, tuple(set_ or ()), command=None)
+        rows = list(values(asked))
+        width = max(len(f"{key}: {value}") for key, value, _ in rows if len(value) <= _LONGEST)
+        lines = [f"{f'{key}: {value}':<{width}}  # {place}" for key, value, place in rows]
+        costly = list(costs(asked))
+        result = {"values": {key: value for key, value, _ in rows}, "costs": costly}
+        say_result("experiment", result, "\n".join([*lines, *costly]))
+
+
+_LONGEST = 50  # characters of a value that places are lined up behind
+
+
+def values(asked: Any) -> Iterator[tuple[str, str, str]]:
+    """Key, value and place of every entry of a checked file; "default" where it has none."""
+    data = asked.model_dump(mode="json", exclude_none=True, by_alias=True, exclude={"notes"})
+    for location, value in _entries(data):
+        key = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in location)
+        place = asked.place_of(*location).removesuffix(": ") if asked.gives(*location) else ""
+        yield key.removeprefix("."), value, place or "default"
+
+
+def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
+    """Values by location; a list of values is one."""
+    inner = data.items() if isinstance(data, dict) else enumerate(data)
+    for key, value in inner:
+        inside = value if isinstance(value, list) else ()
+        if isinstance(value, dict) or any(isinstance(one, (dict, list)) for one in inside):
+            yield from _entries(value, (*location, key))
+        else:
+            text = (
+                f"[{', '.join(map(spelled, value))}]" if isinstance(value, list) else spelled(value)
+            )
+            yield (*location, key), text
+
+
+def explain_run(asked: Any, writes: str, setup: Any = None) -> None:
+    """Print what a command would compute and write, for its option `--dry-run`.
+
+    The names of each list of the file, and the costs.
+    """
+    lines = []
+    for key, entries in asked:
+        if entries and isinstance(entries, tuple) and all(hasattr(e, "name") for e in entries):
+            lines.append(f"{len(entries)} {key}: {'; '.join(entry.name for entry in entries)}")
+    lines += [*costs(asked, setup), writes, "dry run: nothing was done"]
+    say_result("dry_run", lines, "\n".join(lines))
+
+
+def costs(asked: Any, setup: Any = None) -> Iterator[str]:
+    """Work of a file's run, in numbers; `setup`: objects built of it, where they are."""
+    kind = kind_of(asked)
+    return kind.part(kind.costs)(asked, setup)
+
+
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one.")]
+Browser = Annotated[bool, typer.Option(help="Open the page.")]
+
+
+def serve_page(shown: Any, title: str, port: int, browser: bool) -> None:
+    """Serve until Ctrl-C, and say where. **Errors**: ConfigError, one line."""
+    from thincam_jax.commands.config_file import ConfigError
+    from thincam_jax.plot.page import serve
+
+    try:
+        told_of = lambda at: say_result("address", at, f"{at}\nCtrl-C ends it.")  # noqa: E731
+        serve(shown, title, port, told_of, browser)
+    except ImportError:
+        raise ConfigError("pages need pip install 'thincam_jax[notebook]'") from None
+    except OSError as error:
+        fault = f"--port {port}: {error.strerror}"
+        raise ConfigError(f"{fault}; give another, or leave it out") from None
+
+
+def explore(
+    config: ConfigFile, set_: Overrides = None, port: Port = 0, browser: Browser = True
+) -> None:
+    """Turn the numbers of a study's first camera, on a page in the browser.
+
+    Only this machine reaches it, and only with the address that is printed. Ctrl-C ends it.
+    """
+    with reported(lambda: "interrupted"):
+        from thincam_jax.commands.kinds import load_study
+
+        asked = load_study(config, tuple(set_ or ()), "explore takes a study")
+        from thincam_jax.commands.study.build import build_study
+        from thincam_jax.plot.explorer import Explorer
+
+        study = build_study(asked)
+        exposure = study.exposures[0]
+        light = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
+        explorer = Explorer(study.camera(exposure), **light)
+        serve_page(explorer, asked.name, port, browser)

@@ -23,7 +23,7 @@ from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sections import ExperimentConfig
 from thincam_jax.commands.terminal import tell
-from thincam_jax.imaging.display import png_bytes
+from thincam_jax.imaging.encoding import png_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,7 +7,7 @@ import io
 import os
 import sys
 
-from thincam_jax.commands.interrupt import end_on_interrupt
+from thincam_jax.commands.terminal import end_on_interrupt
 
 
 def main() -> None:

@@ -3,9 +3,12 @@
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
 
+import _thread
 import contextlib
 import functools
+import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,13 +18,57 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from thincam_jax._core.progress import repeating
-from thincam_jax._core.text import escaped
-from thincam_jax.commands.interrupt import INTERRUPTED, interruptible
+from thincam_jax._core.table import escaped
 
 if TYPE_CHECKING:
     import rich.progress
 
     from thincam_jax._core.table import Table
+
+
+INTERRUPTED = 130  # the shells' exit code after Ctrl-C
+
+
+def end_on_interrupt() -> None:
+    """Let Ctrl-C end the process in one line, from now on."""
+    signal.signal(signal.SIGINT, leave)
+    sys.unraisablehook = _again
+
+
+def leave(*_: object) -> None:
+    """Leave at once: an exception would meet imports and libraries not ready for one."""
+    os.write(2, b"thincam: interrupted\n")
+    os._exit(INTERRUPTED)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Work that has something to keep: Ctrl-C is a KeyboardInterrupt in it."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not leave:  # another program's
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _again(lost: "sys.UnraisableHookArgs") -> None:
+    """A KeyboardInterrupt that a callback could not pass on, as XLA's at a garbage collection."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    import threading
+
+    # To the main thread, which may be waiting in the system.
+    if hasattr(signal, "pthread_kill"):
+        again = signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)
+    else:  # Windows
+        again = _thread.interrupt_main, ()
+    threading.Timer(0.05, *again).start()
+
 
 WRONG_INPUT = 2
 # What a command prints, by its options `--json` and `--quiet`.

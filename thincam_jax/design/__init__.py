@@ -2,7 +2,6 @@
 
 from thincam_jax._core.names import modules_of
 from thincam_jax.design.design import shots as shots
-from thincam_jax.design.frequencies import Polar as Polar
 from thincam_jax.design.fronts import find_front as find_front
 from thincam_jax.design.landscape import landscape_around as landscape_around
 from thincam_jax.design.layout import write_gds as write_gds
@@ -16,6 +15,7 @@ from thincam_jax.design.search import SearchSettings as SearchSettings
 from thincam_jax.design.search import find_designs as find_designs
 from thincam_jax.design.sensitivity import sensitivity_around as sensitivity_around
 from thincam_jax.design.setup import PhotonNoise as PhotonNoise
+from thincam_jax.design.setup import Polar as Polar
 from thincam_jax.design.setup import PowerLaw as PowerLaw
 from thincam_jax.design.setup import Setup as Setup
 from thincam_jax.design.setup import SignalNoise as SignalNoise

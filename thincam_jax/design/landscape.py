@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem, Objective
@@ -75,7 +76,7 @@ class Landscape:
         - `costs`: where they are drawn over a single number; by default on the line.
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
-        from thincam_jax.plot.curves import draw_landscape
+        from thincam_jax.plot.cameras import draw_landscape
         from thincam_jax.plot.frame import new_figure
 
         ax = new_figure(7.6, 6.0).subplots() if ax is None else ax
@@ -85,6 +86,7 @@ class Landscape:
 
 
 @checked
+@watched("computing the landscape")
 def landscape_around(
     problem: DesignProblem, design: Design, *, count: int = 61, at_a_time: int = AT_A_TIME
 ) -> Landscape:

@@ -24,9 +24,8 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.response import capture_light, responses, signal_variance, spectral_density
-from thincam_jax.design.setup import Setup
+from thincam_jax.design.setup import Frequencies, Setup
 
 DEFAULT_BAND = (0.05, 0.5)  # of the highest frequency
 # Increase counted as 1 % worse, and 10 log10(1.01) dB for values in dB.

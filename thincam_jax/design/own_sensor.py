@@ -19,7 +19,7 @@ from thincam_jax.design.objectives import BayesError
 from thincam_jax.design.problem import DesignProblem, FrequencyCounts, design_problem
 from thincam_jax.design.search import Found, best_apart, best_random, evaluate, improved, sampled
 from thincam_jax.design.setup import PhotonNoise, PowerLaw, Setup, SignalNoise
-from thincam_jax.design.space import REPORTED, DesignSpace, Variable
+from thincam_jax.design.space import DesignSpace, Variable
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.reconstruction.synthesis import phase_pairs
 
@@ -51,8 +51,7 @@ class SensorDesign:
 
     def table(self) -> Table:
         """The three designs, with units."""
-        variables, base = self.problem.space.variables, self.problem.space.base
-        names = [REPORTED[v.name].of_shots(v.shots(base)) for v in variables]
+        names, base = self.problem.space.labels, self.problem.space.base
         words = "found", "the thesis' pair", f"best of {self.evaluations} random ones"
         designs = self.best.design, base, self.random
         rows = [
@@ -63,9 +62,9 @@ class SensorDesign:
 
     def __str__(self) -> str:
         """The table, and a line for the plateau of each number."""
-        lines, base = [str(self.table()), ""], self.problem.space.base
-        for v, (low, high) in zip(self.problem.space.variables, self.plateaus, strict=True):
-            name, unit = REPORTED[v.name].of_shots(v.shots(base)).rsplit(", ", 1)
+        lines = [str(self.table()), ""]
+        for label, (low, high) in zip(self.problem.space.labels, self.plateaus, strict=True):
+            name, unit = label.rsplit(", ", 1)
             lines.append(f"any {name} between {low:.3g} and {high:.3g} {unit} is within 0.1 dB")
         return "\n".join(lines)
 

@@ -28,9 +28,8 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.module import Module
+from thincam_jax._core.module import Key, Module, random_key
 from thincam_jax._core.precision import as_complex
-from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.end_to_end import restore_by
 from thincam_jax.design.objectives import Channels, bayes_error
 from thincam_jax.design.phase_retrieval import contour_target, match_error, retrieve_phase
@@ -39,12 +38,11 @@ from thincam_jax.design.stochastic import adam
 from thincam_jax.design.training import CaptureSum, relative_error
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
-from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.sampling import require_phase_sampling
+from thincam_jax.lensless.resolve import require_phase_sampling
 
 # Of the angle u, whose range from the lowest to the highest relief is π/2.
 _RATE = 0.05
@@ -132,7 +130,7 @@ def contour_mask(
     ```python
     import thincam_jax as tc
     from thincam_jax.design.phase_mask import contour_mask
-    from thincam_jax.lensless.propagation.path import LightPath
+    from thincam_jax.lensless.camera import LightPath
 
     blank = tc.lensless.masks.MaskBlank((64, 64), 0.01, 1.52)
     mask = contour_mask(0, blank, LightPath(5e-4, 5.0), feature=0.08, line_width=0.02)

@@ -13,9 +13,8 @@ from jaxtyping import Array, Float
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Polar, Quadrant
 from thincam_jax.design.objectives import ObjectiveData
-from thincam_jax.design.setup import PhotonNoise, Setup
+from thincam_jax.design.setup import PhotonNoise, Polar, Quadrant, Setup
 from thincam_jax.design.space import DesignSpace
 
 # (design, data) → cost to minimise, at module level or a frozen object: it is compiled once.

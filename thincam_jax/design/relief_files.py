@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.files import MeasurementError, read_json, write_whole
-from thincam_jax.imaging.display import png_bytes
+from thincam_jax.imaging.encoding import png_bytes
 from thincam_jax.imaging.refractive_index import (
     AbstractIndex,
     CauchyIndex,

@@ -30,10 +30,9 @@ from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core.precision import as_complex, phasor
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Frequencies, Polar, Quadrant
-from thincam_jax.design.setup import Setup
+from thincam_jax.design.setup import Frequencies, Polar, Quadrant, Setup
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import ZoneOrders, pairs
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.separable_transfer import TransferFactors, overlaps_of
 
 

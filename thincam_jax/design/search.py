@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.module import Module
+from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import whole
-from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.space import DesignSpace, active_limits
@@ -77,7 +77,8 @@ class Descents(eqx.Module):
 class Found(Module):
     """A local optimum.
 
-    - `design`; `values`: its free numbers, in the order of the space's variables.
+    - `design`; `values`: its free numbers, in the order of the space's variables, and `named`:
+      the same by name and unit, as "β of shot 1, rad/mm²".
     - `objective`: its value there.
     - `status`: end of the descent that led there.
     - `active`: the limits it lies against, in words.
@@ -85,11 +86,12 @@ class Found(Module):
     """
 
     design: Design
-    values: Float[Array, " variable"]
+    values: Float[Array, " variable"] = eqx.field(repr=False)
     objective: float
     status: Status
     active: tuple[str, ...]
     point: Float[Array, " variable"]
+    named: dict[str, float] = eqx.field(default_factory=dict)
 
 
 class Search(Module):
@@ -106,6 +108,7 @@ class Search(Module):
 
 
 @checked
+@watched("searching designs")
 def find_designs(
     problem: DesignProblem, settings: SearchSettings | None = None, *, key: Key
 ) -> Search:
@@ -400,8 +403,9 @@ def ranked(space: DesignSpace, ended: Descents, separation: float) -> tuple[Foun
 
 def _found(space: DesignSpace, place, value, status: Status) -> Found:
     point = jnp.asarray(place, space.lower.dtype)
-    active = active_limits(space, point)
-    return Found(space.design(point), space.values(point), float(value), status, active, point)
+    values, active = space.values(point), active_limits(space, point)
+    named = dict(zip(space.labels, np.asarray(values).tolist(), strict=True))
+    return Found(space.design(point), values, float(value), status, active, point, named)
 
 
 def without_repeats(found: Iterable[Found], separation: float = SEPARATION) -> tuple[Found, ...]:

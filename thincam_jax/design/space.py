@@ -158,6 +158,11 @@ class DesignSpace(eqx.Module):
         """Number of free numbers."""
         return len(self.variables)
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the free numbers with shots and units."""
+        return tuple(REPORTED[v.name].of_shots(v.shots(self.base)) for v in self.variables)
+
     def design(self, point: Float[Array, " variable"]) -> Design:
         """The design of a point of the unit cube."""
         return self._with_values(self.values(point))

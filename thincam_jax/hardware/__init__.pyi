@@ -1,5 +1,7 @@
 """The names of `thincam_jax.hardware`; `__init__.py` reads them from here."""
 
+from thincam_jax.hardware.base import HardwareError as HardwareError
+
 from . import plans as plans
 from .acquisition.acquire import acquire as acquire
 from .acquisition.read import Acquisition as Acquisition
@@ -8,4 +10,3 @@ from .base import Camera as Camera
 from .base import CameraSettings as CameraSettings
 from .base import Display as Display
 from .base import Stage as Stage
-from .errors import HardwareError as HardwareError

@@ -12,7 +12,7 @@ from filelock import FileLock
 from filelock import Timeout as LockTimeout
 
 from thincam_jax._core.files import read_regular, write_whole
-from thincam_jax.hardware.errors import Busy
+from thincam_jax.hardware.base import Busy
 
 
 @contextmanager

@@ -19,9 +19,8 @@ from thincam_jax._core.files import write_whole
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
-from thincam_jax.hardware.base import CameraSettings, Frame
-from thincam_jax.hardware.errors import HardwareError
-from thincam_jax.imaging.display import jpeg_bytes
+from thincam_jax.hardware.base import CameraSettings, Frame, HardwareError
+from thincam_jax.imaging.encoding import jpeg_bytes
 from thincam_jax.measured.examination import examine
 from thincam_jax.measured.options import Preparation
 from thincam_jax.measured.raw import Raw

@@ -206,7 +206,10 @@ class Scene(Module):
     ):
         lights = [light for light in (spectrum, wavelength) if light is not None]
         if len(lights) != 1:
-            raise TypeError("give the light of a Scene once: a Spectrum, or wavelength= in mm")
+            what = "is given twice" if lights else "is missing"
+            raise TypeError(
+                f"the light of the Scene {what}; give wavelength=530 * nm, or a Spectrum"
+            )
         planes = (planes,) if isinstance(planes, ImagePlane) else planes
         if not isinstance(planes, Iterable) or not all(isinstance(p, ImagePlane) for p in planes):
             raise TypeError(f"planes is {checks.shown(planes)}; give an ImagePlane, or several")

@@ -15,6 +15,7 @@ with s/4, gives back what the denoiser took from modes that the captures know we
 """
 
 import dataclasses
+import functools
 import math
 import os
 import time
@@ -41,7 +42,7 @@ from thincam_jax.reconstruction.normal_equations import (
     normal_equations,
     padded_field,
 )
-from thincam_jax.reconstruction.outside_light import beyond_field, covering, pinned
+from thincam_jax.reconstruction.outside_light import covering, pinned, reaching_beyond
 from thincam_jax.reconstruction.parallel import independent_parts
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
@@ -55,7 +56,6 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
-from thincam_jax.reconstruction.result import saying
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
@@ -214,12 +214,11 @@ class PlugAndPlay(AbstractIterativeSolver):
         done, seconds = max(len(history) - 1, 0), time.perf_counter() - began
         whole_image = jnp.stack(images).reshape(problem.image_shape)
         outcome = Outcome(whole_image, status, tuple(history), done, seconds)
-        result, wide, beyond = recording.reconstruction(outcome, self.name), None, ""
-        if status in ("converged", "iterations_exhausted"):
-            wide, beyond = beyond_field(recording, problem, whole_image, self.synthesis)
-        if wide is not None:
-            result = self.solve(wide, start=start, callback=callback)
-        return saying(result, beyond, result.reason)
+        result = recording.reconstruction(outcome, self.name)
+        if status not in ("converged", "iterations_exhausted"):
+            return result
+        solve = functools.partial(self.solve, start=start, callback=callback)
+        return reaching_beyond(solve, recording, problem, whole_image, result, self.synthesis)
 
     def _begin_smooth(self, recording: Recording, problem: InverseProblem, runs: list["_Run"]):
         """Begin the runs with images by total variation of the noise that was found."""
@@ -251,7 +250,7 @@ class _Run:
     """The iteration of one image: `result` is the last finite one, `mistake` that of the noise."""
 
     def __init__(self, solver: PlugAndPlay, problem: InverseProblem, like: AbstractNormal | None):
-        scaled = ScaledProblem(problem, iterations=_UNIT)
+        scaled = ScaledProblem(problem, iterations=_UNIT, whole=True)
         self.solver, self.unit = solver, scaled.image_unit
         # 1/variance of a capture in these units, and the weights, as they were given.
         self.given_precision = scaled.curvature * scaled.image_unit**2

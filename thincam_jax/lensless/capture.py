@@ -8,13 +8,14 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from thincam_jax._core.arguments import checked
+from thincam_jax._core.progress import watched
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
 from thincam_jax.lensless.plan.run import CapturePlan, run_plan
-from thincam_jax.lensless.sampling import warn_if_unresolved
+from thincam_jax.lensless.resolve import warn_if_unresolved
 
 _ON_AXIS = (
     "the sensor's angular_response is left out: every point has the light of the axis; give "
@@ -23,6 +24,7 @@ _ON_AXIS = (
 
 
 @checked
+@watched("capturing")
 def capture(
     camera: LenslessCamera,
     scene: Scene,

@@ -19,10 +19,10 @@ from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.cost import convolution_cost
 from thincam_jax.lensless.field import field_fit
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import spectral_psf
+from thincam_jax.lensless.resolve import convolution_cost
 
 # Pixels by which a field grows where an image moves.
 _STEP = 16

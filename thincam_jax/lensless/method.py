@@ -4,7 +4,7 @@ import math
 import warnings
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import Literal, TypeGuard, get_args
+from typing import Literal, get_args
 
 import jax
 import numpy as np
@@ -15,6 +15,7 @@ from thincam_jax._core.precision import PRECISIONS, AccuracyWarning, Precision, 
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
+    has_few_terms,
     term_count,
     zone_orders,
 )
@@ -41,9 +42,6 @@ CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMP
 # of the far edge turn by up to 10 cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000
 # of the amplitude: 8 nodes are 2e-3 off there, 16 8e-5, 24 1e-10.
 PIXEL_NODES = 24
-# Terms of a mask up to which `separable` squares them one by one, in one dimension; of more, it
-# adds up the field first.
-_MOST_TERMS = 128
 # Points a pixel for its average then: 1 to 4 % off where a pixel holds some ten fringes.
 LATTICE_POINTS = 21
 _LATTICE = (
@@ -51,11 +49,6 @@ _LATTICE = (
     f"{LATTICE_POINTS} points a pixel, 1 to 4 % off where cells are fine; "
     "PsfMethod({!r}, nodes=144) is five times closer, and takes seven times as long"
 )
-
-
-def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:
-    """Whether the mask is a sum of so few products that its PSF is a short sum of them, too."""
-    return isinstance(mask, AbstractFactoredMask) and term_count(mask).terms <= _MOST_TERMS
 
 
 def parts_of(mask: AbstractMask) -> str:
@@ -171,7 +164,7 @@ def psf_method(
         if counted or has_few_terms(mask):
             return method
         text = _LATTICE.format(parts_of(mask), method.model)
-        warnings.warn(text, AccuracyWarning, stacklevel=5)
+        warnings.warn(text, AccuracyWarning, stacklevel=6)
         return replace(method, nodes=LATTICE_POINTS)
     least = 3 if method.pixel_integration else 1
     return replace(

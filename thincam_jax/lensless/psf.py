@@ -27,27 +27,20 @@ from thincam_jax._core.precision import (
     turn_phasor,
 )
 from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.base import AbstractMask, require_factored
-from thincam_jax.lensless.method import (
-    PIXEL_NODES,
-    SAMPLED,
-    Model,
-    PsfMethod,
-    as_method,
-    has_few_terms,
-)
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
+from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
+from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
-from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
-from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
+from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
 from thincam_jax.lensless.propagation.geometric import geometric
-from thincam_jax.lensless.propagation.paraxial import paraxial
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.lensless.propagation.separable import separable
-from thincam_jax.lensless.propagation.separable_field import separable_image
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
+from thincam_jax.lensless.propagation.separable import (
+    SeparableSum,
+    centre_phase,
+    separable,
+    separable_image,
+)
 from thincam_jax.lensless.propagation.skew import skew_image
 from thincam_jax.lensless.resolve import resolve
 
@@ -87,7 +80,7 @@ def psf(
     `wavelength` and `object_distance`.
 
     **Errors**: ValueError for what is out of range, for unknown models and for phases that float32
-    does not hold (see `thincam_jax.lensless.digits`), TypeError for a mask
+    does not hold (see `thincam_jax.lensless.resolve`), TypeError for a mask
     that the model cannot take, MemoryError (before any work, with the estimate) for a size that
     does not fit.
 
@@ -104,9 +97,7 @@ def psf(
     **See also**: `otf`, `choose_model`, `capture`.
     """
     path = camera.path(wavelength, object_distance, at)
-    return _in_precision_of(
-        camera, _psf, *resolve(camera, path, as_method(model, pixel_integration))
-    )
+    return _computed(_psf, camera, path, model, pixel_integration)
 
 
 def psf_about_ray(
@@ -118,19 +109,21 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
-    mask, grid, path, method = resolve(camera, path, method)
-    wide = _in_steps(mask, grid, path, method)
-    h = _in_precision_of(camera, _psf, mask, wide, path, method)
-    return h if wide is grid else cut(h, middle_corner(grid.shape, wide.shape), grid.shape)
+    grid, wide = camera.sensor.grid, _in_steps(camera, path, method)
+    if wide is grid:
+        return _computed(_psf, camera, path, method)
+    h = _computed(_psf, camera.on_grid(wide), path, method)
+    return cut(h, middle_corner(grid.shape, wide.shape), grid.shape)
 
 
-def _in_steps(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod) -> Grid:
+def _in_steps(camera: LenslessCamera, path: LightPath, method: PsfMethod) -> Grid:
     """More samples of a closed form, up to a step, within which sizes share a program.
 
     It takes a second to compile, and hundredths to run.
     """
-    closed = method.model == "separable" and not path.skew and has_few_terms(mask)
-    if not closed or checks.holds_traced(mask, grid, path):
+    grid = camera.sensor.grid
+    closed = method.model == "separable" and not path.skew and has_few_terms(camera.mask)
+    if not closed or checks.holds_traced(camera.mask, grid, path):
         return grid
     rows, columns = (n + (-n - n % 2) % 2 ** max(1, n.bit_length() - 2) for n in grid.shape)
     return grid.with_shape((rows, columns))
@@ -184,9 +177,7 @@ def otf(
     **See also**: `psf`, `lensless.phase_shift.fringe_scanned_otf`.
     """
     path = camera.path(wavelength, object_distance, at)
-    return _in_precision_of(
-        camera, _otf, *resolve(camera, path, as_method(model, pixel_integration))
-    )
+    return _computed(_otf, camera, path, model, pixel_integration)
 
 
 @checked
@@ -223,7 +214,7 @@ def mtf(
     print(contrast.shape)  # (2,)
     ```
 
-    **See also**: `otf`, `plot.otf`, `design.transfer.modulation_transfer`.
+    **See also**: `otf`, `plot.otf`, `design.ranking.modulation_transfer`.
     """
     grid = camera.sensor.grid
     given = jnp.linspace(0.0, 0.5, 64) / grid.pitch if frequencies is None else frequencies
@@ -232,7 +223,7 @@ def mtf(
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
     path = camera.path(wavelength, object_distance)
-    h = _in_precision_of(camera, _psf, *resolve(camera, path, as_method(model, pixel_integration)))
+    h = _computed(_psf, camera, path, model, pixel_integration)
     return _contrast(h, grid, rho)
 
 
@@ -310,11 +301,17 @@ def _otf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
     return spectrum * rows[:, None] * columns
 
 
-def _in_precision_of(camera: LenslessCamera, function, *resolved):
-    """Value of a function of what `resolve` gives, in the camera's precision."""
-    *numbers, method = resolved
+def _computed(
+    function,
+    camera: LenslessCamera,
+    path: LightPath,
+    model: Model | PsfMethod,
+    pixel_integration: bool = True,
+):
+    """`function` of what `resolve` gives, in the camera's precision."""
+    *numbers, method = resolve(camera, path, model, pixel_integration)
     with allow(method.float_type, *numbers):
-        result = function(*resolved)
+        result = function(*numbers, method)
     own = precision_of(camera.sensor.pitch)
     return result if method.precision == own else cast(result, own)
 

@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Float32
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaiced
-from thincam_jax.measured.dark import FoundLevels, corner_levels, find_levels
+from thincam_jax.measured.merging import FoundLevels, corner_levels, find_levels
 from thincam_jax.measured.options import Centre, Preparation, by_files, check_match
-from thincam_jax.measured.preparation_log import Centring, CleanUp, ImageLog, PreparationLog
 from thincam_jax.measured.raw import MeasurementError, Raw
 from thincam_jax.measured.sensor import SensorCalibration
+from thincam_jax.measured.write import Centring, CleanUp, ImageLog, PreparationLog
 
 Background = Raw | SensorCalibration | float | int | Literal["corner", "found"]
 

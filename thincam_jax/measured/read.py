@@ -323,20 +323,44 @@ def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
         pixels = file.raw_image_visible.copy()
         if pixels.ndim != 2:
             raise CaptureFileError("holds colours, no mosaic; save it as TIFF")
-        letters = file.color_desc.decode("ascii", "replace")
-        sites = [letters[n] for n in file.raw_colors_visible[:2, :2].ravel()]
-        sites = "".join(sites) if np.asarray(file.raw_pattern).size == 4 else ""
-        facts = _sensor_facts(sites, file.black_level_per_channel, [int(file.white_level)])
+        letters, colours = file.color_desc.decode("ascii", "replace"), file.raw_colors_visible
+        sites, pattern = "", np.asarray(file.raw_pattern).shape
+        if len(pattern) == 2:  # else grey
+            sites = "".join(letters[n] for n in colours[: pattern[0], : pattern[1]].ravel())
+        black: Any = np.asarray(file.black_level_per_channel)
+        black = black[colours[:2, :2]].ravel() if sites else black
+        white = [int(file.white_level)]
+        facts = _sensor_facts(sites, pattern, black, white)
         facts |= _exposure(getattr(getattr(file, "other", None), "shutter_speed", None))
-        return [pixels], {"bits": 16, **facts, "orientation": _FLIPS[file.sizes.flip]}
+        facts |= {"orientation": _FLIPS[file.sizes.flip]}
+        return [_levelled(pixels, black, white)], {"bits": 16, **facts}
 
 
-def _sensor_facts(sites: str, black: Any, white: Any) -> _Facts:
-    facts: _Facts = {"bayer": sites} if sites in PATTERNS else {}
-    facts |= {"black_level": float(np.mean(black))} if len(black) in (1, 4) else {}
+def _sensor_facts(sites: str, pattern: Any, black: Any, white: Any) -> _Facts:
+    """Facts by the colours of a mosaic's `pattern` (rows, columns), and by its levels."""
+    if sites and sites not in PATTERNS:
+        size = "×".join(map(str, pattern))
+        name = {"6×6": "X-Trans, 6×6", "2×2": sites}.get(size, size)
+        raise CaptureFileError(
+            f"has a mosaic of {name} pixels, and {', '.join(PATTERNS)} are read; save its colours, "
+            "rawpy.imread(path).postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16)"
+        )
+    facts: _Facts = {"bayer": sites} if sites else {}
+    facts |= {"black_level": float(np.max(black))} if len(black) in (1, 4) else {}
     if len(white) == 0 or white[0] >= 2**16 - 1:  # which may stand for none
         return facts
     return facts | {"white_level": int(white[0]), "bits": max(8, int(white[0]).bit_length())}
+
+
+def _levelled(pixels: np.ndarray, black: Any, white: Any) -> np.ndarray:
+    """Pixels of 2×2 black levels, raised to the highest of them; what is saturated stays so."""
+    if len(black) != 4 or np.ptp(black) == 0 or pixels.dtype.kind != "u":
+        return pixels
+    tile = np.rint(np.max(black) - np.reshape(black, (2, 2))).astype(np.int64)
+    rows, columns = pixels.shape
+    raised = pixels + np.tile(tile, ((rows + 1) // 2, (columns + 1) // 2))[:rows, :columns]
+    most = min([*map(int, white[:1]), np.iinfo(pixels.dtype).max])
+    return np.where(pixels < most, np.minimum(raised, most), pixels).astype(pixels.dtype)
 
 
 def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], _Facts]:
@@ -348,22 +372,22 @@ def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], _Facts]:
     """Pixels (y, x) or (y, x, channel) of each image, and facts; no bits for floats."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         pages = _whole_pages(file, stack)
-        images = [_read_page(page) for page in pages]
-        return images, _tiff_facts(pages[0])
+        facts, black, white = _tiff_facts(pages[0])
+        return [_levelled(_read_page(page), black, white) for page in pages], facts
 
 
-def _tiff_facts(page: tifffile.TiffPage) -> _Facts:
-    """Facts about an image by the tags of TIFF and DNG."""
+def _tiff_facts(page: tifffile.TiffPage) -> tuple[_Facts, Any, Any]:
+    """Facts about an image by the tags of TIFF and DNG, and its black and white levels."""
     bits, facts = page.bitspersample, {"orientation": page.tags.valueof(ORIENTATION, 1)}
     exif = page.tags.valueof(_EXIF, {}) or {}
     facts |= _exposure(exif.get("ExposureTime"), page.tags.valueof(_EXPOSURE_TIME))
     if page.dtype is not None and page.dtype.kind == "u" and isinstance(bits, int):
         facts |= {"bits": bits} if 8 <= bits <= 16 else {}
     if page.photometric != tifffile.PHOTOMETRIC.CFA:
-        return facts
-    sites = "".join("RGB???"[min(n, 5)] for n in bytes(page.tags.valueof(33422, b"")))
+        return facts, (), ()
+    sites = "".join("RGBCMYW"[min(n, 6)] for n in bytes(page.tags.valueof(33422, b"")))
     black, white = (np.ravel(page.tags.valueof(tag, [])) for tag in (50714, 50717))
-    return facts | _sensor_facts(sites, black, white)
+    return facts | _sensor_facts(sites, page.tags.valueof(33421, ()), black, white), black, white
 
 
 def _read_page(page: tifffile.TiffPage) -> np.ndarray:

@@ -11,14 +11,13 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.design.training_search import TrainingError
-from thincam_jax.plot.curves import draw_landscape
+from thincam_jax.plot.cameras import draw_landscape
 from thincam_jax.plot.frame import drawing, line_style
 
 if TYPE_CHECKING:
     from thincam_jax.design.design import Shot
     from thincam_jax.design.landscape import Landscape
-    from thincam_jax.design.ranking import RankedDesign
-    from thincam_jax.design.transfer import ModulationTransfer
+    from thincam_jax.design.ranking import ModulationTransfer, RankedDesign
     from thincam_jax.studies.design import FoundDesigns
     from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores
     from thincam_jax.studies.study import Study

@@ -19,7 +19,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.controls import Control, turned
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import Quantity
-from thincam_jax.imaging.display import jpeg_bytes, png_bytes
+from thincam_jax.imaging.encoding import jpeg_bytes, png_bytes
 from thincam_jax.imaging.metrics import align, psnr
 from thincam_jax.imaging.metrics.mtf import cut_off, first_common_zero, low_frequency_value
 from thincam_jax.imaging.scene import ImagePlane, Scene
@@ -29,8 +29,9 @@ from thincam_jax.lensless import psf as psfs
 from thincam_jax.lensless.accuracy.select import choose_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
+from thincam_jax.lensless.masks.base import has_few_terms
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod, has_few_terms
+from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
 from thincam_jax.lensless.phase_shift import fringe_scanned_otf, with_phase, without_carrier
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.reconstruction.fringe_filter import FringeScanning

@@ -9,7 +9,7 @@ import numpy as np
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, pixel_pitch
-from thincam_jax.imaging.display import eight_bit, pictures
+from thincam_jax.imaging.encoding import eight_bit, pictures
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.plot.frame import Figure, new_figure, sheet, show_image

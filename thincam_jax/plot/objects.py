@@ -6,7 +6,7 @@ import matplotlib.figure
 import numpy as np
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.imaging.display import eight_bit, pictures
+from thincam_jax.imaging.encoding import eight_bit, pictures
 from thincam_jax.plot.frame import drawing, show_image
 
 if TYPE_CHECKING:

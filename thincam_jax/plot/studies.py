@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thincam_jax.imaging.display import as_picture
+from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.imaging.metrics.mtf import low_frequency_value
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.plot.cameras import draw_psf as draw_camera_psf
@@ -16,9 +16,8 @@ from thincam_jax.plot.frame import drawing, line_style, sheet
 
 if TYPE_CHECKING:
     from thincam_jax.lensless.exposures import Exposure
-    from thincam_jax.studies.evaluate import Contrasts, Evaluation
-    from thincam_jax.studies.response import Response
-    from thincam_jax.studies.simulate import Capture
+    from thincam_jax.studies.evaluate import Capture, Contrasts, Evaluation
+    from thincam_jax.studies.result import Response
     from thincam_jax.studies.study import Study, Target
 
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from thincam_jax._core.quantity import quantities
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import GaussianNoise, PoissonGaussianNoise, Sensor
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.plot.frame import drawing, line_style
 
 _MAPS = 4  # of methods, at most

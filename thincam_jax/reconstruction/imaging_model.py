@@ -20,8 +20,7 @@ from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank, Resampled
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.field import field_fit, tangents_of
-from thincam_jax.lensless.light import light_over_field
+from thincam_jax.lensless.field import field_fit, light_over_field, tangents_of
 from thincam_jax.lensless.method import MODELS, Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import spectral_psf
 

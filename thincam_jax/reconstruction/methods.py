@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 import sys
 import time
 from typing import ClassVar
@@ -17,15 +18,15 @@ from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix
 from thincam_jax.imaging.operators.low_rank import LowRank
+from thincam_jax.reconstruction.assembly import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.coarse import coarsened, finer
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
-from thincam_jax.reconstruction.other_psf import RESIZE, better_psf
-from thincam_jax.reconstruction.outside_light import beyond_field, covering
+from thincam_jax.reconstruction.other_psf import better_psf
+from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
-from thincam_jax.reconstruction.planes import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.poisson import PoissonTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
@@ -247,19 +248,17 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
-        wide, beyond = None, ""
-        if _is_settled(outcome):
-            wide, beyond = beyond_field(recording, problem, outcome.image, self.synthesis)
-        if wide is not None:
-            again = self.solve(wide, start=start, callback=callback)
-            return saying(again, beyond, again.reason)
+        found, settled = outcome.image, _is_settled(outcome)
         if unit is not None:
-            outcome = dataclasses.replace(outcome, image=outcome.image / unit)
+            outcome = dataclasses.replace(outcome, image=found / unit)
         if rule:
             outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
         result = recording.reconstruction(outcome, self.name, float(problem.tau))
-        said = "" if beyond and outcome.reason.endswith(RESIZE) else outcome.reason
-        return saying(result, reason, said, beyond)
+        result = saying(result, reason, outcome.reason)
+        if not settled:
+            return result
+        solve = functools.partial(self.solve, start=start, callback=callback)
+        return reaching_beyond(solve, recording, problem, found, result, self.synthesis)
 
 
 def _is_settled(outcome: Outcome) -> bool:

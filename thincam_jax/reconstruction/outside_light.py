@@ -6,6 +6,7 @@ in the whole field that the sensor sees how much light moves out, and how far.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,10 +18,12 @@ from thincam_jax.imaging.operators.crop_convolution import middle_corner, place
 from thincam_jax.reconstruction.coarse import coarsened
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import Schedule, iterate
+from thincam_jax.reconstruction.other_psf import RESIZE
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.result import Reconstruction, saying
 from thincam_jax.reconstruction.smooth_misfit import misfit_of
 from thincam_jax.reconstruction.splittings import admm_method
 
@@ -97,19 +100,28 @@ def outside_light(
     return OutsideLight(share, same_parity((height, width), model.cameras[0].sensor.shape))
 
 
-def beyond_field(
-    recording: Recording, problem: InverseProblem, image: Image, synthesis: np.ndarray | None
-) -> tuple[Recording | None, str]:
-    """The recording to solve once more, with the field that holds the light, and the sentence.
+def reaching_beyond(
+    solve: Callable[[Recording], Reconstruction],
+    recording: Recording,
+    problem: InverseProblem,
+    image: Image,
+    result: Reconstruction,
+    synthesis: np.ndarray | None = None,
+) -> Reconstruction:
+    """The result, with the sentence on light from outside of its field.
 
-    None where the field is given, which stays, and where no light comes from outside.
+    Where no field is given, the recording is solved again in the field that holds the light.
+
+    - `image`: image of the `problem`, by which the residual is judged.
     """
     outside = outside_light(recording, problem, image, synthesis)
     if outside is None:
-        return None, ""
+        return result
     if recording.imaging_model.pixels is not None:  # type: ignore[union-attr]
-        return None, str(outside)
-    return with_field(recording, outside.field_shape), outside.taken
+        said = "" if result.reason.endswith(RESIZE) else result.reason
+        return saying(dataclasses.replace(result, reason=""), said, str(outside))
+    again = solve(with_field(recording, outside.field_shape))
+    return saying(again, outside.taken, again.reason)
 
 
 def covering(recording: Recording, start: Float[Array, "..."] | None) -> Recording:

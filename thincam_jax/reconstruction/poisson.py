@@ -31,7 +31,7 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.quantity import whole
 from thincam_jax.reconstruction.imaging_model import Cameras, distance_ratios
 from thincam_jax.reconstruction.iterate import Callback, Outcome, outcome_of_run
-from thincam_jax.reconstruction.outside_light import beyond_field, covering
+from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     backprojected_noise,
@@ -42,7 +42,6 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
-from thincam_jax.reconstruction.result import saying
 from thincam_jax.reconstruction.solver import (
     DEFAULT_TAU,
     AbstractIterativeSolver,
@@ -194,12 +193,11 @@ class PoissonTV(AbstractIterativeSolver):
             tolerance=self.tolerance,
         )
         result = recording.reconstruction(outcome, self.name, float(self.tau))
-        wide, beyond = None, ""
-        if isinstance(model, Cameras) and problem.image_shape[-3] == 1:  # with noise that is found
-            wide, beyond = beyond_field(recording, recording.problem(), outcome.image, None)
-        if wide is not None:
-            result = self.solve(wide, start=start)
-        return saying(result, beyond, result.reason)
+        if not isinstance(model, Cameras) or problem.image_shape[-3] > 1:
+            return result
+        found = recording.problem()  # with noise that is found
+        solve = functools.partial(self.solve, start=start)
+        return reaching_beyond(solve, recording, found, outcome.image, result)
 
 
 def solve_poisson(

@@ -57,6 +57,7 @@ from thincam_jax.reconstruction.normal_equations import (
     SeparableNormal,
     normal_equations,
 )
+from thincam_jax.reconstruction.outside_light import reaching_beyond
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     or_one,
@@ -159,11 +160,11 @@ class Ridge(AbstractSolver):
         if prior is not None:
             outcome = replace(outcome, image=mean + prior.image(outcome.image))
         found = recording.reconstruction(outcome, self.name)
-        if found.status != "iterations_exhausted":
-            return found
-        error = f"{outcome.history[-1].primal:.1g} of it, after {outcome.iterations} iterations"
-        advice = "give more, a larger ridge, or double precision (JAX_ENABLE_X64=1)"
-        return replace(found, reason=f"may differ from the minimiser by {error}: {advice}")
+        if found.status == "iterations_exhausted":
+            error = f"{outcome.history[-1].primal:.1g} of it, after {outcome.iterations} iterations"
+            advice = "give more, a larger ridge, or double precision (JAX_ENABLE_X64=1)"
+            return replace(found, reason=f"may differ from the minimiser by {error}: {advice}")
+        return reaching_beyond(self.solve, recording, problem, outcome.image, found, self.synthesis)
 
     def deviation(self, recording: Recording) -> Float[Array, "*plane y x"]:
         r"""The posterior standard deviation of each pixel, in the scene's unit.

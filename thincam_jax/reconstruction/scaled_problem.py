@@ -29,10 +29,11 @@ POWER_ITERATIONS = 40
 class WeightedOperator(AbstractOperator):
     r"""Weighted operators of a problem and its batch, :math:`f \mapsto (\sqrt{w_k}\, A_k f)_k`.
 
-    A_k f is less its weighted mean where there is a background to find.
+    A_k f is less its weighted mean where there is a background to find, unless it is `whole`.
     """
 
     problem: InverseProblem
+    whole: bool = eqx.field(default=False, static=True)
 
     @property
     def in_shape(self) -> tuple[int, ...]:
@@ -44,12 +45,17 @@ class WeightedOperator(AbstractOperator):
 
     def __call__(self, image: Image):
         seen = [forward(operator, image) for operator in self.problem.operators]
-        known = without_background(self.problem, seen)
+        known = without_background(self.problem, seen, self._lit)
         return tuple(jnp.sqrt(w) * d for w, d in zip(self.problem.weights, known, strict=True))
 
     def adjoint(self, capture: tuple[Float[Array, "..."], ...]):
         pairs = zip(self.problem.weights, capture, strict=True)
-        return back_projected(self.problem, [c / jnp.sqrt(or_one(w)) for w, c in pairs])
+        differences = [c / jnp.sqrt(or_one(w)) for w, c in pairs]
+        return back_projected(self.problem, differences, self._lit)
+
+    @property
+    def _lit(self):
+        return (jnp.asarray(False),) * len(self.problem.captures) if self.whole else None
 
 
 class ScaledProblem(eqx.Module):
@@ -63,7 +69,8 @@ class ScaledProblem(eqx.Module):
       factor for captures.
     - `curvature`: Lipschitz constant of the problem given, with a margin.
 
-    Fewer `iterations` of the power method are faster, and ‖√w A‖ may then be somewhat above 1.
+    Fewer `iterations` of the power method are faster, and ‖√w A‖ may then be somewhat above 1. The
+    norm of the `whole` A has the uniform light that a background takes: so has rounding.
     """
 
     problem: InverseProblem
@@ -71,21 +78,24 @@ class ScaledProblem(eqx.Module):
     capture_unit: Float[Array, ""]
     curvature: Float[Array, ""]
 
-    def __init__(self, problem: InverseProblem, iterations: int = POWER_ITERATIONS):
+    def __init__(
+        self, problem: InverseProblem, iterations: int = POWER_ITERATIONS, *, whole: bool = False
+    ):
         # The minimiser does not depend on these units, nor do its derivatives on theirs.
-        operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem), iterations)
+        fixed = jax.lax.stop_gradient(problem)
+        operator_unit, captured, heaviest = _units(fixed, iterations, whole)
         self.problem = _divided(problem, operator_unit, captured, heaviest)
         self.image_unit, self.capture_unit = captured / operator_unit, captured
         self.curvature = heaviest * operator_unit**2
 
 
-@functools.partial(jax.jit, static_argnames="iterations")
-def _units(problem: InverseProblem, iterations: int):
+@functools.partial(jax.jit, static_argnames=("iterations", "whole"))
+def _units(problem: InverseProblem, iterations: int, whole: bool):
     """Units of operators, captures and weights."""
     heaviest = or_one(jnp.stack([jnp.max(w) for w in problem.weights]).max())
     strongest = or_one(jnp.stack([_strength(o) for o in problem.operators]).max())
     captured = _root_mean_square(problem.captures)
-    norm = _norm(_divided(problem, strongest, captured, heaviest), iterations)
+    norm = _norm(_divided(problem, strongest, captured, heaviest), iterations, whole)
     return strongest * norm, captured, heaviest
 
 
@@ -116,15 +126,15 @@ def _times(operator: AbstractOperator, factor) -> AbstractOperator:
     return Scaled(operator, factor)
 
 
-def _norm(problem: InverseProblem, iterations: int) -> Float[Array, ""]:
+def _norm(problem: InverseProblem, iterations: int, whole: bool) -> Float[Array, ""]:
     """‖√w A‖ with a margin, by the power method, at most the bound of the spectra."""
     dtype = problem.captures[0].dtype
     (first, *others), (weight, *_) = problem.operators, problem.weights
-    alone = not others and weight.size == 1 and not problem.has_background
+    alone = not others and weight.size == 1 and (whole or not problem.has_background)
     if alone:  # the operator may know its own norm
         found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=iterations, dtype=dtype)
     else:
-        found = WeightedOperator(problem).norm(iterations=iterations, dtype=dtype)
+        found = WeightedOperator(problem, whole).norm(iterations=iterations, dtype=dtype)
     found = MARGIN * found
     operators = convolutions(problem)
     if operators is None:

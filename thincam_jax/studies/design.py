@@ -24,9 +24,11 @@ from thincam_jax.design.landscape import Landscape, landscape_if_any
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.ranking import (
+    ModulationTransfer,
     RankedDesign,
     distinct_designs,
     found_name,
+    modulation_transfer,
     rank_designs,
     rank_trained,
     score_design,
@@ -41,14 +43,12 @@ from thincam_jax.design.training_search import (
     build_training,
     training_pixels,
 )
-from thincam_jax.design.transfer import ModulationTransfer, modulation_transfer
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.solver import AbstractSolver
-from thincam_jax.studies.held_out import HeldOut, further_photographs, hold_out
 from thincam_jax.studies.study import Method, Study, Synthesis
-from thincam_jax.studies.trials import simulate_trials
+from thincam_jax.studies.trials import HeldOut, further_photographs, hold_out, simulate_trials
 
 RANDOM = "random search"
 

@@ -9,8 +9,7 @@ from thincam_jax._core.table import Table, number
 from thincam_jax.design.design import Shot
 from thincam_jax.design.sensitivity import FreeValue
 from thincam_jax.design.space import REPORTED
-from thincam_jax.studies.held_out import HeldOut
-from thincam_jax.studies.trials import Comparison, Spread
+from thincam_jax.studies.trials import Comparison, HeldOut, Spread
 
 _ALWAYS = ("beta", "distance")  # are reported of every shot
 _ONE_PER_CENT_DB = 10 * math.log10(1.01)  # the change of the error that tolerances are of

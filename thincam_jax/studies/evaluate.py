@@ -1,27 +1,32 @@
-"""Reconstructions of a study: agreement with the scene, and what is resolved of it."""
+"""Captures of a study and their reconstructions: agreement with the scene, and what is resolved."""
 
+import functools
 import math
-from collections.abc import Callable, Mapping
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.imaging.display import as_picture
+from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
-from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.imaging.scene import ImagePlane, Scene
+from thincam_jax.imaging.sensor import electrons_per_unit, read_out
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
+from thincam_jax.lensless import forward
 from thincam_jax.lensless.exposures import Exposure
-from thincam_jax.lensless.field import tangents_of
-from thincam_jax.lensless.light import light_over_field
+from thincam_jax.lensless.field import light_over_field, tangents_of
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
@@ -30,8 +35,56 @@ from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.reconstruction.wiener import Wiener
-from thincam_jax.studies.simulate import Capture, stacked
 from thincam_jax.studies.study import Method, Study, Target
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Image read out (*channel, y, x), and the variance of its noise (*channel,)."""
+
+    image: np.ndarray
+    variance: np.ndarray
+
+
+def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
+    """Light on the sensor, (*channel, y, x), without saturation."""
+    scene, pixels = Scene(planes, exposure.wavelength), study.pixel_integration
+    method = PsfMethod(study.model, None, pixels, field_tolerance=study.field_tolerance)
+    images = (
+        forward.expose(study.camera(exposure), plane, scene.spectrum, method)
+        for plane in scene.planes
+    )
+    return functools.reduce(operator.add, images)
+
+
+def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: int = 0) -> Capture:
+    """Capture from a noise-free image of the target of a number.
+
+    The noise is that of the image; its random key is the same however a study is interrupted, and
+    another one for each further trial.
+    """
+    seed = jax.random.key((study.seed + trial) % 2**32)
+    place = study.exposures.index(exposure)
+    key = jax.random.fold_in(jax.random.fold_in(seed, number), place)
+    sensor, noise = study.camera(exposure).sensor, study.noise
+    if noise is None:
+        variance = np.zeros(clean.shape[:-2], clean.dtype)
+    else:
+        variance = np.asarray(noise.variance(clean, electrons_per_unit(sensor, clean)))
+    return Capture(np.asarray(read_out(sensor, clean, noise=noise, key=key)), variance)
+
+
+def take(study: Study, exposure: Exposure, target: Target) -> Capture:
+    """One capture of a target, which may move meanwhile."""
+    plane = ImagePlane(target.plane.image, target.distance, target.width, exposure.moves)
+    return expose(study, exposure, noise_free(study, exposure, plane), target.number)
+
+
+def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
+    """Images (capture, *channel, y, x) and variances (capture, *channel)."""
+    images, variances = [c.image for c in captures], [c.variance for c in captures]
+    return jnp.asarray(np.stack(images)), jnp.asarray(np.stack(variances))
+
 
 # The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
 _MINIMUM_ROWS = 7

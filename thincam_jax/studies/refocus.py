@@ -26,23 +26,31 @@ from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import resize
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.reconstruction.depth.find import (
+    MEASURES,
     DepthMap,
     FocusCurves,
     FocusPeak,
+    Measure,
     all_in_focus,
     depth_map,
     find_distances,
     object_regions,
 )
-from thincam_jax.reconstruction.depth.focus import MEASURES, Measure
 from thincam_jax.reconstruction.depth.refocus import (
     RefocusSweep,
     axial_resolution,
     refocus_distances,
 )
 from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.studies.evaluate import reconstructor, rounded, sample
-from thincam_jax.studies.simulate import Capture, expose, noise_free, stacked
+from thincam_jax.studies.evaluate import (
+    Capture,
+    expose,
+    noise_free,
+    reconstructor,
+    rounded,
+    sample,
+    stacked,
+)
 from thincam_jax.studies.study import Method, Study, Target
 
 if TYPE_CHECKING:
@@ -437,7 +445,11 @@ class RefocusRun:
     def result(self) -> RefocusResult:
         """All of it, at the end."""
         refocusing, asked = self.refocusing, self.refocusing.sweep
-        sweep = _joined(refocusing, self.swept)
+        images, distances = jnp.stack([one.image for one in self.swept]), asked.distances
+        # p·t/d of any image over its t.
+        slope = jnp.reshape(jnp.asarray(self.swept[-1].pitch, images.dtype), ()) / distances[-1]
+        solver = refocusing.sweep_method.solver.name
+        sweep = RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, solver)
         found = find_objects(refocusing, sweep)
         depth = depth_map(
             sweep, measure=asked.measure, smoothing=asked.smoothing, window=asked.window
@@ -452,15 +464,6 @@ class RefocusRun:
             self.methods,
             self.images,
         )
-
-
-def _joined(refocusing: RefocusStudy, focused: list[Reconstruction]) -> RefocusSweep:
-    """Reconstructions that are focused on each of the distances, as one sweep."""
-    images, distances = jnp.stack([one.image for one in focused]), refocusing.sweep.distances
-    # p·t/d of any image over its t.
-    slope = jnp.reshape(jnp.asarray(focused[-1].pitch, images.dtype), ()) / distances[-1]
-    method = refocusing.sweep_method.solver.name
-    return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, method)
 
 
 def psnr_of_objects(

@@ -16,14 +16,13 @@ from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.encoding import encode_srgb
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import AbstractNoise, PoissonGaussianNoise, Sensor
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, psf_change
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, edge_frequency
 from thincam_jax.lensless.method import Model
-from thincam_jax.lensless.propagation.obliquity import psf_change
 from thincam_jax.lensless.psf import psf
-from thincam_jax.lensless.sampling import unresolved
+from thincam_jax.lensless.resolve import unresolved
 from thincam_jax.reconstruction import synthesis as syntheses
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.solver import AbstractSolver

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.waveguide.camera import SeeThroughCamera
@@ -118,6 +119,7 @@ def smeared_rays(
     return SmearedRays(rays.points[..., None, 1::-1], rays.weight)
 
 
+@watched("tracing the screen")
 def system_operator(
     camera: SeeThroughCamera | Sequence[SeeThroughCamera],
     plane: ObjectPlane | Sequence[ObjectPlane],

@@ -12,19 +12,6 @@ from thincam_jax.design.objectives import ResolutionLimit, RobustError, Toleranc
 LIGHT = "noise={read_noise: 4, electrons: 900}"
 
 
-def test_the_setup_is_that_of_the_file(tmp_path):
-    problem = tiny.built(tmp_path).problem
-    setup, frequencies = problem.exact.setup, problem.exact.frequencies
-    assert float(setup.sensor_width) == pytest.approx(48 * 0.04)  # the shorter side
-    assert float(setup.noise.snr_db) == 30
-    assert float(setup.prior.exponent) == 2.5
-    assert not setup.pixel_integration
-    assert problem.exact.synthesis.shape == (2, 4)
-    # Half of the pixels' Nyquist frequency, 12.5 cycles/mm, at 3 mm.
-    assert float(frequencies.highest) == pytest.approx(3.0 * 12.5 / 2)
-    assert frequencies.axis.shape == problem.data.frequencies.radius.shape == (64,)
-
-
 def test_measured_prior_and_photon_noise(tmp_path):
     setup = tiny.built(tmp_path, "prior={measured: true}", LIGHT).problem.data.setup
     assert 2.6 < float(setup.prior.exponent) < 9  # smooth blobs fall off faster than photographs

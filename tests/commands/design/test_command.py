@@ -39,10 +39,6 @@ def test_interrupt(file, interrupted, tmp_path, monkeypatch):
 
 
 class TestExitCode2:
-    def test_missing_file(self, tmp_path):
-        line = one_line(call("design", tmp_path / "no.yaml"))
-        assert line == f"{tmp_path / 'no.yaml'} is missing; give the path of a YAML experiment file"
-
     @pytest.mark.parametrize(
         ("setting", "part"),
         [
@@ -77,10 +73,3 @@ class TestExitCode2:
 
     def test_a_study_is_told_apart(self, file):
         assert "give it to 'thincam design'" in one_line(call("run", file))
-
-
-@pytest.mark.thorough
-def test_coarse_pixels_are_reported_once(file, interrupted, tmp_path):
-    result = call("design", file, "--out", tmp_path / "out", "--set", "sensor.pitch=88um")
-    line, _ = result.stderr.splitlines()
-    assert line.startswith("thincam: warning: the mask casts 7.73 cycles/mm on pixels that resolve")

@@ -10,8 +10,8 @@ import thincam_jax as tc
 from helpers import ROOT, relative_l2
 from thincam_jax.commands import cli
 from thincam_jax.commands.reconstruct.options import read_camera
+from thincam_jax.studies.evaluate import take
 from thincam_jax.studies.prepared import computed_psf
-from thincam_jax.studies.simulate import take
 
 
 @pytest.fixture

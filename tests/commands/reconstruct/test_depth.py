@@ -65,16 +65,6 @@ def test_depth_map_and_image_that_is_sharp_everywhere(paths, tmp_path):
     assert [name[-8:] for name in record["psfs"]] == ["60mm.tif", "80mm.tif", "20mm.tif"]
 
 
-@pytest.mark.thorough
-def test_pages_of_a_file_are_psfs_too(paths, tmp_path):
-    more = ("--distances", "60mm,80mm,120mm", *ALIKE, "--linear", "none")
-    assert call(paths, tmp_path / "a.png", *more, psf="stack").exit_code == 0
-    assert call(paths, tmp_path / "b.png", *more, psf="folder").exit_code == 0
-    for a in tmp_path.glob("a*.png"):
-        assert a.read_bytes() == (tmp_path / a.name.replace("a", "b", 1)).read_bytes()
-    assert not list(tmp_path.glob("*.npy"))
-
-
 @pytest.mark.parametrize(
     ("distances", "said"),
     [

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.ndimage
 import tifffile
 from commands.reconstruct import simulated
 from commands.reconstruct.test_command import one_line, record_of, runner
@@ -250,19 +249,3 @@ def test_no_bit_depth_needs_a_background(files, tmp_path):
         assert log["capture"]["background"] == "found with the image"
     line = one_line(call(out, *given, "--background", "corner"))
     assert "the PSF's corner says nothing about it" in line and line.endswith("give 'found'")
-
-
-@pytest.mark.thorough
-@pytest.mark.filterwarnings("default")
-def test_findings_are_told_once(files, tmp_path):
-    """A blurred PSF without a dark corner, for three captures."""
-    folder = tmp_path / "several"
-    folder.mkdir()
-    for n in range(3):
-        simulated.write_tiff(folder / f"{n}.tif", tifffile.imread(files["capture"]))
-    psf = scipy.ndimage.gaussian_filter(tifffile.imread(files["psf"]).astype(float), 20)
-    simulated.write_tiff(tmp_path / "wide.tif", 4000 * psf / psf.max())
-    result = call(tmp_path / "out", "--psf", tmp_path / "wide.tif", "--capture", folder)
-    assert result.exit_code == 0, result.exception
-    lines = result.stderr.splitlines()
-    assert lines and len(lines) == len(set(lines)), result.stderr

@@ -14,7 +14,7 @@ from thincam_jax.commands.reconstruct import jobs, run
 from thincam_jax.commands.reconstruct.jobs import plan_jobs
 from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
 from thincam_jax.commands.reconstruct.run import Failed, Finished, run_jobs
-from thincam_jax.measured import MeasurementError, Preparation
+from thincam_jax.measured import MeasurementError
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.studies import prepared
 
@@ -84,22 +84,6 @@ def test_same_image_as_step_by_step(folder, tmp_path):
     assert float(result.record["reconstruction"]["relative_data_residual"]) == pytest.approx(told)
 
 
-def test_saturated_pixels_have_no_weight(folder, tmp_path):
-    """A residual over the others only, and an image as of the capture without them."""
-    capture = folder / "first.tif"
-    raw = simulated.tifffile.imread(capture)
-    raw[20:24, 30:40] = 4095
-    simulated.tifffile.imwrite(capture, raw)
-    output = Output(tmp_path / "first.npy")
-    planned = plan_jobs(capture, sources(folder), output)
-    (result,) = run_jobs(planned, sources(folder), SHORT, output)
-    assert isinstance(result, Finished)
-    record = result.record
-    assert record["preparation"]["capture"]["saturated"] == 40
-    assert float(record["reconstruction"]["relative_data_residual"]) < 0.1
-    assert simulated.correlation(np.load(output.path), simulated.scene()[1]) > 0.9
-
-
 @pytest.mark.parametrize("room", [1_000, 10_000])
 def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, room):
     """Of the first or the last file. Not even what stood there before is touched."""
@@ -142,14 +126,6 @@ def test_more_than_the_memory(folder, tmp_path, monkeypatch):
     assert str(result.error).endswith("give a larger downsample")
 
 
-def test_all_saturated(folder, tmp_path):
-    output = Output(tmp_path / "first.png")
-    planned = plan_jobs(folder / "first.tif", sources(folder), output)
-    low = sources(folder, preparation=Preparation(saturation=1e-3))
-    (result,) = run_jobs(planned, low, SHORT, output)
-    assert isinstance(result, Failed) and "without a trusted pixel" in str(result.error)
-
-
 class TestPlan:
     def test_captures_are_all_images_but_the_sources(self, folder, tmp_path):
         """Hidden files, folders and other files are none."""
@@ -162,10 +138,6 @@ class TestPlan:
         assert names == ["out/first.png", "out/first.tif"]
         assert not (tmp_path / "out").exists()
         plan_jobs(folder, sources(folder), Output(tmp_path / "more" / "out"))  # can be made
-
-    def test_folder_for_one_capture(self, folder, tmp_path):
-        (job,) = plan_jobs(folder / "second.tif", sources(folder), Output(tmp_path))
-        assert job.record == tmp_path / "second.json"
 
     @pytest.mark.parametrize(
         ("out", "message"),
@@ -200,9 +172,3 @@ class TestPlan:
         (tmp_path / "image.npy").mkdir()
         with pytest.raises(MeasurementError, match=r"image\.npy: is a folder"):
             plan_jobs(folder / "first.tif", sources(folder), Output(tmp_path / "image.png"))
-
-
-def test_iterations_are_those_given_or_the_methods_own():
-    for method, own in (("admm_tv", 300), ("pnp", 5)):
-        assert Recipe(method=method).solver(1).iterations == own
-        assert Recipe(method=method, iterations=3).solver(1).iterations == 3

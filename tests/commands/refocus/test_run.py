@@ -5,20 +5,15 @@ import re
 from dataclasses import asdict
 
 import numpy as np
-import PIL.Image
 import pytest
 from commands.pages import assert_says_its_result
 from commands.refocus import tiny
 from commands.study.tiny import Told
 from studies import tiny_refocus
 
-from helpers import ROOT
-from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.kinds import load_experiment, load_study
-from thincam_jax.commands.refocus import RefocusConfig, build_refocus, run_refocus
+from thincam_jax.commands.refocus import build_refocus, run_refocus
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.sections import StudyConfig
 
 
 @pytest.fixture(scope="module")
@@ -43,36 +38,6 @@ def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
     assert sweep["distances_mm"] == np.round(np.asarray(result.sweep.distances), 4).tolist()
     for name, curve in sweep["curves"].items():
         np.testing.assert_allclose(curve, result.found.curve(name), rtol=1e-5)
-
-
-def test_progress_and_files(run):
-    study, path, metrics, texts = run
-    assert len(texts) == texts.total == 4 + 13 + 2 * 2 + 1
-    files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
-    figures = {f"figures/{n}" for n in ("sweep.png", "sweep.webp", "focus.png", "depth.png")}
-    images = {f"images/{m}--{t}mm.png" for m in ("conventional", "wiener") for t in (20, 45)}
-    assert (
-        files
-        == {
-            ".lock",
-            "config.yaml",
-            "inputs.json",
-            "metrics.json",
-            "environment.json",
-            "report.html",
-        }
-        | figures
-        | {"figures/methods.png", "images/all-in-focus.png"}
-        | images
-    )
-    assert load_experiment(path / "config.yaml") == study.study.config
-
-
-def test_animation_goes_there_and_back(run):
-    with PIL.Image.open(run[1] / "figures" / "sweep.webp") as animation:
-        assert animation.n_frames == 13 + 11
-        rows, columns = run[0].field_shape(run[0].sweep_method)
-        assert animation.size == (columns, rows + 24)
 
 
 def test_report_stands_alone_and_is_escaped(run):
@@ -120,17 +85,3 @@ def test_what_only_building_shows_is_refused(override, part, tmp_path):
         build_refocus(tiny.experiment(tmp_path, override))
     (line,) = str(caught.value).split("\n")
     assert part in line
-
-
-def test_kinds_of_files(tmp_path):
-    assert isinstance(load_experiment(ROOT / "configs" / "quick.yaml"), StudyConfig)
-    shipped = load_experiment(ROOT / "configs" / "fza_refocus.yaml")
-    assert isinstance(shipped, RefocusConfig)
-    assert len(build_refocus(shipped).objects) == 2
-    assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
-    with pytest.raises(ConfigError, match="kind: 'sweep' is unknown; write 'kind: refocus'"):
-        tiny.experiment(tmp_path, text="kind: sweep\n")
-    with pytest.raises(ConfigError, match="is of kind refocus; a sweep takes a study"):
-        load_study(tiny.write(tmp_path), (), "a sweep takes a study")
-    with pytest.raises(FileNotFoundError, match="is missing"):
-        load_experiment(tmp_path / "none.yaml")

@@ -8,8 +8,7 @@ from commands.study import tiny
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.studies.evaluate import reconstructor
-from thincam_jax.studies.simulate import expose, noise_free, stacked, take
+from thincam_jax.studies.evaluate import expose, noise_free, reconstructor, stacked, take
 
 ELECTRONS = ("sensor.electrons=2e5", "noise={read_noise: 2}")
 
@@ -44,17 +43,6 @@ def test_a_mask_may_be_a_rectangle(tmp_path):
     assert study.camera(method.exposures[2]).mask.extent == pytest.approx((3.5, 1.2))
     told, _ = study.warnings  # the other is of the field
     assert told.startswith("the mask casts 13.5 cycles/mm on pixels that resolve 12.5")
-
-
-def test_the_same_shot_twice_and_longer(tmp_path):
-    """Another exposure is another capture; the same one would count its noise twice."""
-    _, method = pairs(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}")
-    assert len(set(method.exposures)) == 4
-    with pytest.raises(ConfigError, match="shots hold an entry twice"):
-        pairs(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, width: 2000 um}")
-    longer = "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}"
-    with pytest.raises(ConfigError, match="shots hold an entry twice"):
-        pairs(tmp_path, longer, "methods.1.synthesis=contrasts")
 
 
 def test_a_second_take_has_noise_of_its_own(tmp_path):

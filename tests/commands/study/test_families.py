@@ -13,7 +13,7 @@ from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.lensless.masks import MaskBlank, maximum_length_sequence
 from thincam_jax.lensless.masks.display import on_display
-from thincam_jax.lensless.masks.reliefs import voronoi_fresnel
+from thincam_jax.lensless.masks.phase import voronoi_fresnel
 
 HEAD, TAIL = tiny.TEXT.split("methods:")[0], "targets:" + tiny.TEXT.split("targets:")[1]
 METHOD = "{name: one, kind: wiener, synthesis: separate, shots: [{distance: 3 mm}]}"

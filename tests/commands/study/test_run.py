@@ -1,36 +1,32 @@
 """Runs: what they leave behind, that they repeat and go on after an interruption; their report."""
 
-import base64
 import gc
-import io
 import json
 import re
 import shutil
 from dataclasses import asdict
 
 import numpy as np
-import PIL.Image
 import pytest
 import skimage.io
 from commands.pages import assert_says_its_result
 from commands.study import tiny
-from commands.sweep import mini
-from commands.test_cli import call
 
-from thincam_jax._core.environment import environment
 from thincam_jax._core.precision import double_precision, is_double
 from thincam_jax.commands import run_folder
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.kinds import load_experiment
-from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder, origin_of
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.run import page, run_study
-from thincam_jax.studies.evaluate import Resolved, Scores, evaluate_method
-from thincam_jax.studies.response import ResponseLimits, method_response
-from thincam_jax.studies.result import MethodScores, StudyScores, findings
-from thincam_jax.studies.simulate import take
+from thincam_jax.commands.study.run import run_study
+from thincam_jax.studies.evaluate import Resolved, Scores, evaluate_method, take
+from thincam_jax.studies.result import (
+    MethodScores,
+    ResponseLimits,
+    StudyScores,
+    findings,
+    method_response,
+)
 from thincam_jax.studies.study import Published
 
 EVIL = "<script>alert(1)</script> & \"quoted\" <img src='http://example.org/x.png'>"
@@ -91,12 +87,6 @@ def test_metrics_hold_every_method_and_target(whole):
     assert set(metrics["methods"]["pairs"]["published"].values()) == {None}
 
 
-def test_resolved_element_is_given_on_the_object_and_on_the_sensor(whole):
-    resolved = whole[2].methods["conventional"].resolved
-    assert resolved.object_mm == 5.0  # the coarsest: a sixteenth of 80 mm
-    assert resolved.sensor_cycles_per_mm == pytest.approx(100 / 3 / 5.0, abs=1e-3)
-
-
 def test_reconstruction_is_upright(whole):
     """The picture's red blob is up and to the left, the green one down and to the right."""
     for method in ("conventional", "pairs"):
@@ -105,27 +95,6 @@ def test_reconstruction_is_upright(whole):
         for channel, blob in enumerate([(12, 15), (30, 40), (20, 45)]):
             brightest = np.unravel_index(np.argmax(image[..., channel]), image.shape[:2])
             assert np.linalg.norm(np.subtract(brightest, blob)) < 5
-
-
-def test_folder_holds_what_it_says_and_nothing_half(whole):
-    study, path, _, _ = whole
-    files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
-    expected = {".lock", "config.yaml", "metrics.json", "environment.json", "report.html"}
-    expected |= {"inputs.json"}
-    expected |= {"targets/chart.json", "targets/picture.json"}
-    for target in ("chart", "picture"):
-        shown = [f"{target}--{name}" for name in ("pairs", "scene", "conventional")]
-        names = (f"{target}--capture", *shown, *(f"{one}--detail" for one in shown))
-        expected |= {f"images/{name}.png" for name in names}
-    expected |= {f"figures/{n}.png" for n in ("mtf", "contrast", "psf")}
-    expected |= {
-        f"figures/{kind}-{n}.png" for n in ("chart", "picture") for kind in ("target", "captures")
-    }
-    assert files == expected
-    assert load_experiment(path / "config.yaml") == study.config
-    environment = json.loads((path / "environment.json").read_text("utf-8"))
-    assert environment["seed"] == 3
-    assert environment["versions"]["jax"]
 
 
 @pytest.mark.thorough
@@ -186,14 +155,6 @@ def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
     assert (folder.path / "figures" / "contrast.png").exists()
 
 
-@pytest.mark.thorough
-def test_a_complete_run_is_done_anew_with_the_same_result(whole, taken, monkeypatch):
-    again, metrics = counted(monkeypatch), (whole[1] / "metrics.json").read_bytes()
-    run_study(whole[0], RunFolder(whole[1]), tiny.ignore)
-    assert (whole[1] / "metrics.json").read_bytes() == metrics
-    assert again == taken
-
-
 def test_captures_that_methods_share_are_taken_once(whole, taken):
     for channels in (1, 3):
         settings = [(s.beta, round(s.phase, 6)) for s, c, _ in taken if c == channels]
@@ -201,14 +162,6 @@ def test_captures_that_methods_share_are_taken_once(whole, taken):
         phases = [0.0, quarter, round(np.pi, 6), round(3 * np.pi / 2, 6)]
         assert settings == [(25.0, p) for p in phases] + [(21.0, 0.0), (21.0, phases[3])]
     assert len({image for _, _, image in taken}) == len(taken)  # each has noise of its own
-
-
-def test_broken_result_of_a_target_is_done_again(home, whole):
-    folder = RunFolder(home / "broken")
-    folder.claim(whole[0].config)
-    (folder.path / "targets" / "chart.json").write_text('{"metrics": {"conv', encoding="utf-8")
-    assert folder.finished("chart") is None
-    assert folder.finished("picture") is None
 
 
 @pytest.mark.parametrize(
@@ -311,11 +264,6 @@ class TestCheck:
         (line,) = str(caught.value).split("\n")
         return line
 
-    def test_missing_image(self, tmp_path):
-        config = tiny.study(tmp_path, "targets.1.path=nowhere.png")
-        missing = tmp_path / "nowhere.png"  # beside the experiment file
-        assert f"targets[1]: '{missing}' does not exist" in self.line(config)
-
     # Some decoders leave a damaged file open for the collector.
     @pytest.mark.filterwarnings("ignore::ResourceWarning")
     @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -345,11 +293,6 @@ class TestCheck:
         first, second = str(caught.value).split("\n")
         assert "targets[0]: 'conventional' reconstructs it on 6×6 pixels" in first
         assert "targets[1]: 'conventional' reconstructs it on 4×6 pixels" in second
-
-    def test_camera_that_cannot_be_built(self, tmp_path):
-        line = self.line(tiny.study(tmp_path, "mask.pixel_pitch=0.3 mm"))
-        assert line.startswith("mask, sensor or model: ")
-        assert "not a whole number of cells of pixel_pitch" in line
 
 
 @pytest.mark.thorough
@@ -383,12 +326,6 @@ def run(whole, tmp_path):
     return study, RunFolder(tmp_path / "copy"), scores, assert_says_its_result(path)
 
 
-def rendered(config, folder, scores):
-    """The page made anew."""
-    shown = page(config, scores, ["A finding."])
-    return render_report(shown, config, folder.path, environment())
-
-
 def test_no_reference_outside_the_folder(run):
     _, folder, _, page = run
     tags = " ".join(re.findall(r"<[^>]+>", page))
@@ -403,28 +340,6 @@ def test_no_reference_outside_the_folder(run):
     tags = set(re.findall(r"<\s*([a-z]\w*)", page))
     assert not tags & {"script", "link", "iframe", "object", "embed", "base"}
     assert not re.search(r"url\(|@import|file://", page)
-
-
-def test_pictures_are_copies_of_the_files_that_they_lead_to(run):
-    _, folder, _, page = run
-    pairs = re.findall(r'<a href="([^"]+)"><img src="data:image/webp;base64,([^"]+)"', page)
-    assert len(pairs) == 17
-    for place, data in pairs:
-        copy = np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), float)
-        rows, columns = copy.shape[:2]
-        with PIL.Image.open(folder.path / place) as file:
-            whole = np.asarray(file.convert("RGB").resize((columns, rows)), float)
-        assert copy.std() > 5  # something is drawn
-        assert np.sqrt(np.mean((copy - whole) ** 2)) < 0.5 * whole.std()
-
-
-def test_motion_is_told(run):
-    study, folder, scores, page = run
-    assert "that moves" not in page
-    config, still = study.config, study.config.object
-    moving = config.model_copy(update={"object": still.model_copy(update={"motion": 0.25})})
-    page = rendered(moving, folder, scores)
-    assert "that moves 0.25 mm across during an exposure of 1, λ" in page
 
 
 def test_text_of_the_configuration_is_escaped(run):
@@ -443,25 +358,6 @@ def rows(page):
         [re.sub(r"<[^>]+>", " ", c).strip() for c in re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row)]
         for row in cells
     ]
-
-
-def test_tables_hold_the_metrics(run):
-    _, _, scores, page = run
-    metrics = asdict(scores)
-    table = rows(page)
-    for name, method in metrics["methods"].items():
-        _, quality, resolution = [row for row in table if row[0] == name]
-        for cell, target in zip(quality[2:4], ("chart", "picture"), strict=True):
-            found = method["targets"][target]
-            assert cell == f"{found['psnr_db']:.1f} / {found['ssim']:.2f}"
-        assert quality[1] == "4"
-        cut_off = method["limits"]["cut_off_cycles_per_mm"]
-        assert resolution[5] == f"{cut_off:.1f}"
-    _, conventional, resolution = [row for row in table if row[0] == "conventional"]
-    assert conventional[-1] == "20.3"
-    assert (resolution[1], resolution[3], resolution[-1]) == ("5.00", "4.60", "10.8")
-    _, pairs, resolution = [row for row in table if row[0] == "pairs"]
-    assert (pairs[-1], resolution[3], resolution[4], resolution[-1]) == ("–", "–", "–", "–")
 
 
 def method(psnr, published_psnr, resolved, published_resolved):
@@ -492,16 +388,3 @@ def test_findings_say_how_the_numbers_lie_to_the_published_ones(run):
         "3 %.",
         "From finest to coarsest on the chart: better (1.00 mm), equal (2.00 mm), worse (4.00 mm).",
     ]
-
-
-@pytest.mark.thorough
-def test_pixels_coarser_than_the_zones_are_told_once_here_and_on_the_terminal(tmp_path):
-    out = tmp_path / "out"
-    result = call("run", mini.write(tmp_path), "--out", out, "--set", "sensor.pitch=88um")
-    assert result.exit_code == 0, result.output
-    (line,) = result.stderr.splitlines()
-    told = "the mask casts 7.73 cycles/mm on pixels that resolve 5.68 (Nyquist, 1/(2 pitch))"
-    assert line.startswith(f"thincam: warning: {told}")
-    page = (out / "report.html").read_text("utf-8")
-    assert page.count(told) == 1
-    assert f"<strong>Warning:</strong> {told}" in page

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.sections import StudyConfig
-from thincam_jax.commands.sweep.grid import Axis, read_axes
-from thincam_jax.commands.sweep.point import GridPoint, Metrics, make_points
+from thincam_jax.commands.sweep.point import Axis, GridPoint, Metrics, make_points, read_axes
 
 TEXT = """\
 name: mini

@@ -10,7 +10,7 @@ from commands.sweep import mini
 from commands.test_cli import call, one_line
 
 from helpers import ROOT
-from thincam_jax.commands.sweep import command, run, workers
+from thincam_jax.commands.sweep import command, run
 from thincam_jax.commands.sweep.run import Swept
 
 
@@ -31,25 +31,6 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(run, "run_sweep", swept)
     return given
-
-
-def test_options_and_default_folder(file, asked, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    grid = ("--grid", "seed=0:4:5", "--grid", "methods.*.shots.*.distance=3,4 mm")
-    result = call("sweep", file, *grid, "--set", "name=Other", "--workers", 3)
-    assert result.exit_code == 0, result.output
-    ((points, folder, options),) = asked
-    assert folder.path.as_posix() == "runs/other-sweep"
-    assert len(points) == 10
-    assert all(point.double for point in points)  # as the tests are set
-    assert options == {"scheduler": None, "workers": 3}
-    assert "10 of 10 points: runs/other-sweep/results.parquet" in result.stdout
-    assert result.stderr == ""
-    address = "tcp://192.168.0.2:8786"
-    out = tmp_path / "out"
-    assert call("sweep", file, *grid, "--out", out, "--scheduler", address).exit_code == 0
-    assert asked[1][1].path == out
-    assert asked[1][2] == {"scheduler": address, "workers": None}
 
 
 @pytest.mark.parametrize(("rows", "code"), [(3, 0), (0, 2)])
@@ -110,12 +91,6 @@ class TestExitCode2:
         file = ROOT / "configs" / "fza_refocus.yaml"
         line = one_line(call("sweep", file, "--grid", "seed=1"))
         assert line == f"{file}: is of kind refocus; a sweep takes a study"
-
-    def test_scheduler_that_does_not_answer(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr(workers, "_CONNECT_SECONDS", 0.5)
-        options = ("--grid", "seed=1", "--scheduler", "tcp://127.0.0.1:1")
-        line = one_line(call("sweep", file, *options, "--out", tmp_path / "out"))
-        assert line.startswith("--scheduler tcp://127.0.0.1:1: no scheduler answers there; ")
 
     def test_missing_parts(self, file, monkeypatch):
         def without(name):

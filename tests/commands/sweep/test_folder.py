@@ -62,14 +62,6 @@ def test_rows_are_in_the_order_of_the_grid_and_failures_apart(folder, config):
     assert not list(folder.path.rglob("*.partial"))
 
 
-def test_point_kept_twice_is_one_row(folder, config):
-    points = mini.points(config, "seed=0:1:2")
-    for number in (1, 2):
-        folder.keep(points[0], mini.outcome(number))
-    folder.collect(points)
-    assert [row["psnr_db/single/star"] for row in rows(folder)] == [2.0]
-
-
 def test_failure_goes_when_the_point_succeeds(folder, config):
     points = mini.points(config, "seed=0:1:2")
     folder.keep(points[0], Metrics(None, "why"))
@@ -118,10 +110,6 @@ def test_columns_that_some_rows_lack(folder, config):
     table = pq.read_table(folder.path / "results.parquet")
     assert str(table.schema.field("psnr_db/a/b").type) == "double"
     assert table.column_names[-1] == "seconds"
-
-
-def test_study_is_written_as_it_is_read(folder, config):
-    assert load_experiment(folder.path / "study.yaml") == config
 
 
 def test_folder_of_another_study_or_of_other_things(folder, config, tmp_path):

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.sweep import grid
-from thincam_jax.commands.sweep.grid import read_axes
+from thincam_jax.commands.sweep.point import read_axes
 
 RAW = {
     "seed": 0,
@@ -93,17 +92,6 @@ def test_logarithmic_range_has_equal_ratios(low, high, n):
         assert math.isclose(after / before, ratio, rel_tol=1e-10)
 
 
-@pytest.mark.thorough
-@given(st.text(max_size=30))
-def test_any_text_is_values_or_one_line(text):
-    try:
-        (axis,) = read_axes([f"seed={text}"], RAW)
-    except ConfigError as error:
-        assert str(error).startswith("--grid seed=")
-    else:
-        assert axis.values
-
-
 def test_star_stands_for_every_entry_of_a_list():
     (axis,) = read_axes(["methods.*.shots.*.beta=1:2:2 rad/mm^2"], RAW)
     assert axis.path == "methods.*.shots.*.beta"
@@ -148,10 +136,6 @@ def test_refused(text, part):
     assert part in line
 
 
-def test_no_axis():
-    assert fault().startswith("a sweep needs a --grid: write it as path=lo:hi:n")
-
-
 @pytest.mark.parametrize(
     ("first", "second", "entry"),
     [
@@ -164,10 +148,3 @@ def test_no_axis():
 def test_entry_that_two_axes_set(first, second, entry):
     line = fault(first, second)
     assert line == f"--grid {second}: {entry} is set by --grid {first} too; give it once"
-
-
-def test_too_many_points(monkeypatch):
-    monkeypatch.setattr(grid, "MOST_POINTS", 9)
-    assert fault("seed=0:4:5", "sensor.bit_depth=8,12") == (
-        "the grid has 10 points; give at most 9"
-    )

@@ -1,8 +1,11 @@
-"""Points: their configurations, their keys, and which are refused."""
+"""Points of a sweep: configuration, key, measurement, and their summary."""
 
 import json
+from dataclasses import asdict
 
+import jax
 import numpy as np
+import pyarrow as pa
 import pytest
 import skimage.io
 from commands.study import tiny
@@ -10,8 +13,10 @@ from commands.sweep import mini
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import StudyConfig
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.sweep import point as point_module
-from thincam_jax.commands.sweep.point import described
+from thincam_jax.commands.sweep.point import described, measure_point
+from thincam_jax.commands.sweep.run import summarise
 
 
 @pytest.fixture(scope="module")
@@ -95,25 +100,106 @@ def test_refused_point_has_its_reason(config):
     assert described(bad.values) == "methods.0.shots.0.beta=-5 rad/mm^2"
 
 
-@pytest.mark.parametrize(
-    ("grid", "part"),
-    [
-        ("sed=1,2", "sed: unknown key; allowed here: name, title, seed"),
-        ("mask.radius=1 mm", "mask.radius: unknown key; allowed here: width"),
-        ("mask.width=1,2", "mask.width: 1 has no unit"),
-        ("mask.width=1:2:3 nms", 'has the unknown unit "nms"'),
-        ("methods.3.name=a", "methods has no entry 3"),
-        ("seed=0.5,1.5", "seed: 0.5: input should be a valid integer"),
-    ],
-)
-def test_grid_without_a_point_that_can_be_run(config, grid, part):
-    line = fault(config, grid)
-    assert line.startswith(f"--grid {grid}: ")
-    assert part in line
-
-
 def test_point_that_comes_twice(config):
     line = fault(config, "mask.width=2 mm, 1 mm, 2000 um")
     assert line == (
         "--grid: mask.width=2.0 comes twice: two of its values are the same; give each once"
     )
+
+
+@pytest.mark.thorough
+def test_columns_are_the_metrics_of_a_run(tmp_path):
+    targets = tiny.TEXT[tiny.TEXT.index("  - {name: chart") :]
+    config = tiny.study(tmp_path, text=mini.TEXT[: mini.TEXT.index("  - {name: star")] + targets)
+    (point,) = mini.points(config, "seed=0", double=True)
+    measured = measure_point(point.config, point.double)
+    assert measured.reason is None
+    row = measured.metrics
+    assert row is not None
+    assert row.pop("seconds") > 0
+    expected, study = {}, build_study(config)
+    methods = asdict(study.run().scores)["methods"]
+    for name, method in methods.items():
+        mean = sum(target["psnr_db"] for target in method["targets"].values()) / 2
+        expected[f"mean_psnr_db/{name}"] = pytest.approx(mean, abs=1e-4)
+        key = "mean_psnr_of_pictures_db"
+        expected[f"{key}/{name}"] = method[key]
+        for target, metrics in method["targets"].items():
+            resolved = metrics.pop("resolved")
+            if resolved:
+                metrics |= {f"resolved_{inner}": value for inner, value in resolved.items()}
+            expected |= {f"{key}/{name}/{target}": value for key, value in metrics.items()}
+    assert row == expected
+    assert any(name.startswith("mean_psnr_of_pictures_db/") for name in row)
+
+
+@pytest.mark.thorough
+def test_values_of_one_shape_are_compiled_once(tmp_path):
+    """Counted by JAX's own events of its compiler."""
+    compiled = []
+
+    def listen(event, _, **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    config = mini.study(tmp_path)
+    (first,) = mini.points(config, "seed=0")
+    beta = mini.points(config, "methods.0.shots.0.beta=15:24:4 rad/mm^2")
+    noise = mini.points(config, "noise.snr_db=20:28:3")
+    distance = mini.points(config, "methods.0.shots.0.distance=2.99:2.995:2 mm")
+    jax.clear_caches()
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        assert measure_point(first.config, False).metrics is not None
+        assert compiled
+        compiled.clear()
+        rows = [measure_point(p.config, False).metrics for p in (*beta, *noise, *distance)]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not compiled
+    psnr = [row["psnr_db/single/star"] for row in rows if row is not None]
+    assert len(set(psnr)) == 9  # they are other points
+
+
+def test_camera_that_cannot_be_built_is_a_reason(tmp_path):
+    (point,) = mini.points(mini.study(tmp_path), "mask.pixel_pitch=0.7 mm")
+    measured = measure_point(point.config, False)
+    assert measured.metrics is None
+    assert measured.reason is not None
+    assert measured.reason.startswith("mask, sensor or model: width = 2 mm is not a whole number")
+    assert measured.traceback is None
+
+
+def test_defect_is_a_reason_with_its_traceback(tmp_path, monkeypatch):
+    def broken(_):
+        raise ZeroDivisionError("a\n  defect")
+
+    monkeypatch.setattr("thincam_jax.commands.sweep.point.build_study", broken)
+    (point,) = mini.points(mini.study(tmp_path), "seed=1")
+    measured = measure_point(point.config, False)
+    assert measured.reason == "ZeroDivisionError: a"
+    assert "in broken" in (measured.traceback or "")
+
+
+AXES = ["methods.0.shots.0.beta", "model"]
+COLUMN = "mean_psnr_db/single"
+
+
+def rows():
+    """Six points, of which one has no PSNR; best at β = 20 with the second model."""
+    level = {(15.0, "a"): 20.0, (20.0, "a"): 22.0, (25.0, "a"): None}
+    level |= {(15.0, "b"): 21.0, (20.0, "b"): 24.0, (25.0, "b"): 23.0}
+    return [dict(zip(AXES, at, strict=True), **{COLUMN: psnr}) for at, psnr in level.items()]
+
+
+def test_best_point_and_picture(tmp_path):
+    best = summarise(tmp_path, pa.Table.from_pylist(rows()), AXES)
+    place = "methods.0.shots.0.beta=20.0, model=b"
+    assert best == (f"best mean PSNR of single: 24.00 dB at {place}",)
+    assert skimage.io.imread(tmp_path / "summary.png").std() > 5
+
+
+@pytest.mark.parametrize("table", [{"seed": [1]}, {"seed": [1], COLUMN: [None]}])
+def test_nothing_to_tell(tmp_path, table):
+    assert summarise(tmp_path, pa.table(table), ["seed"]) == ()
+    assert list(tmp_path.iterdir()) == []

@@ -83,16 +83,6 @@ def test_finished_points_are_not_done_again_and_failed_ones_are(config, folder, 
     assert list(failures(folder.path)) == [(-1,)]
 
 
-def test_grid_that_grew(config, folder, at_once):
-    done = at_once[1]
-    run_sweep(mini.points(config, "seed=0:3:4"), folder, mini.ignore)
-    done.clear()
-    points = mini.points(config, "seed=0:5:6")
-    assert run_sweep(points, folder, mini.ignore).rows == 6
-    assert done == [points[4].key, points[5].key]
-    assert [row["seed"] for row in rows(folder.path)] == [0, 1, 2, 3, 4, 5]
-
-
 def test_interrupt_keeps_what_has_ended(config, folder, at_once):
     def interrupt(ended, _):
         if ended == 3:
@@ -227,23 +217,6 @@ def test_sweep_that_is_killed_half_way(tmp_path, count):
     assert line.startswith(
         f"thincam: 1 of {count} points failed; the first (seed=-1): {reason}; all"
     )
-
-
-@pytest.mark.thorough
-def test_sweep_of_200_points_of_which_one_fails_in_its_worker(tmp_path):
-    """Killed half-way as well; an object of 1 mm covers too few pixels."""
-    file, out = mini.write(tmp_path), tmp_path / "out"
-    widths = [1, *(round(79.005 + 0.005 * n, 3) for n in range(199))]
-    grid = f"object.width={','.join(map(str, widths))} mm"
-    kill_half_way(file, out, grid, 100)
-    for _ in range(2):  # it fails again
-        done = finish(file, out, grid)
-        assert done.returncode == 0, done.stderr
-        assert [row["object.width"] for row in rows(out)] == widths[1:]
-        ((values, reason),) = failures(out).items()
-        assert values == (1.0,)
-        assert reason.startswith("targets[0]: 'single' reconstructs it on 1×1 pixels")
-        assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.thorough

@@ -1,7 +1,6 @@
 """Schedulers: one of another process, one without workers, and what is none."""
 
 import logging
-import socket
 
 import distributed
 import pytest
@@ -54,11 +53,3 @@ def test_nobody_answers(monkeypatch):
         line = fault(address)
         assert line.startswith(f"--scheduler {address}: no scheduler answers there; give the addr")
     assert logging.getLogger("distributed").level == level
-
-
-def test_somebody_else_answers(monkeypatch):
-    """A port that takes the connection and says nothing."""
-    monkeypatch.setattr(schedulers, "_CONNECT_SECONDS", 0.5)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        line = fault(f"tcp://127.0.0.1:{server.getsockname()[1]}")
-    assert ": no scheduler answers there; " in line

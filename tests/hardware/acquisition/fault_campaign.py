@@ -19,8 +19,8 @@ from thincam_jax._core.capture_store import CaptureStoreError
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.plan import BLACK
 from thincam_jax.hardware.acquisition.read import Acquisition
-from thincam_jax.hardware.errors import Busy, HardwareError, NotHomed, ProtocolError
-from thincam_jax.hardware.virtual.faults import FAULTS, Fault
+from thincam_jax.hardware.base import Busy, HardwareError, NotHomed, ProtocolError
+from thincam_jax.hardware.virtual.devices import FAULTS, Fault
 
 # What stops a run, to be taken up again; every other fault is recovered from.
 STOPS = {

@@ -26,23 +26,24 @@ from hardware.memory_rig import (
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
 from thincam_jax._core.files import WriteError
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.acquisition import journal, recorder, taker
+from thincam_jax.hardware.acquisition import recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
-from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.base import Frame, Region
-from thincam_jax.hardware.displays import settle
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.acquisition.taker import AutoExposure
+from thincam_jax.hardware.base import (
     Disconnected,
+    Frame,
     IncompleteFrame,
     NotFound,
     NotHomed,
     OutOfRange,
     ProtocolError,
+    Region,
     Saturated,
     Timeout,
 )
+from thincam_jax.hardware.displays import settle
 from thincam_jax.hardware.plans import hadamard, pictures
 from thincam_jax.measured.calibration import HadamardCaptures, HadamardSeries, recover_matrix
 
@@ -326,16 +327,6 @@ def test_what_is_no_frame_is_one_line_and_nothing_is_lost(path, monkeypatch, kin
     require_whole(path)
 
 
-def test_a_frame_that_does_not_come_once_is_taken_again(path, monkeypatch):
-    world, taken = World(), MemoryCamera.trigger_and_grab
-    count = iter(range(99))
-    once = lambda self, timeout: taken(self, timeout) if next(count) != 5 else None  # noqa: E731
-    monkeypatch.setattr(MemoryCamera, "trigger_and_grab", once)
-    done = run(world, path)
-    assert done.complete and len(done.recovered) == 1 and "IncompleteFrame" in done.recovered[0]
-    require_whole(path)
-
-
 def test_the_exposure_is_found_once(path):
     wanted = AutoExposure(target=0.3, longest=0.05)
     procedure = dataclasses.replace(QUICK, exposure="auto", auto_exposure=wanted)
@@ -438,15 +429,6 @@ def test_a_frame_that_comes_too_late_is_no_other_steps_frame(path):
     require_whole(path)
 
 
-def test_the_first_frame_may_fail_too(path):
-    """A short one says nothing of the shape, which the store is made for."""
-    world = World()
-    for fault in ("short_frame", "dropped_frame", "unplug"):
-        world.faults.inject(fault)
-    assert len(run(world, path).recovered) == 3 and not world.faults.waiting()
-    require_whole(path)
-
-
 def test_frames_of_a_store_have_one_shape(path):
     regions = [SETTINGS, dataclasses.replace(SETTINGS, region=Region(1, 2, 4, 5))]
     steps = [dataclasses.replace(step, settings=n % 2) for n, step in enumerate(PLAN.steps)]
@@ -468,7 +450,7 @@ def test_a_journal_that_cannot_be_made_is_told_and_made_later(tmp_path, monkeypa
         return os.open(path, flags, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(journal, "os", SimpleNamespace(**{**vars(os), "open": no_inode}))
+        patch.setattr(recorder, "os", SimpleNamespace(**{**vars(os), "open": no_inode}))
         with pytest.raises(WriteError, match="journal.jsonl: cannot be written .*; make room"):
             run(World(), tmp_path / "a.zarr")
     assert run(World(), tmp_path / "a.zarr").complete

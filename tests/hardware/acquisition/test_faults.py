@@ -16,8 +16,8 @@ from hardware.memory_rig import World, by_rows, fiducial_plan, picture_plan, sce
 from helpers import ROOT, quick
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.read import Acquisition
-from thincam_jax.hardware.errors import IncompleteFrame, ProtocolError
-from thincam_jax.hardware.virtual.faults import FAULTS
+from thincam_jax.hardware.base import IncompleteFrame, ProtocolError
+from thincam_jax.hardware.virtual.devices import FAULTS
 
 PROCESS = [sys.executable, ROOT / "tests" / "hardware" / "memory_rig.py"]
 PATHS = os.pathsep.join([str(ROOT), str(ROOT / "tests")])

@@ -22,7 +22,7 @@ from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.plans import scene
 from thincam_jax.hardware.virtual import VirtualRig
 from thincam_jax.hardware.virtual.rig import Electronics
-from thincam_jax.measured import Preparation, measure_sensor, prepare
+from thincam_jax.measured import Preparation, prepare
 from thincam_jax.measured.calibration import HadamardCaptures
 
 PLAN = by_rows(fiducial_plan(4, dark_every=2))
@@ -252,25 +252,6 @@ def test_colours_are_those_of_the_scene_wherever_the_region_begins(
     counts = raw.full_scale * ready.capture.mean(axis=(1, 2))
     electron = Electronics().scale(settings)[0]
     np.testing.assert_allclose(counts, 0.1 * electron * np.array(Coloured.colours), rtol=0.02)
-
-
-def test_a_sensor_is_measured_from_a_store(tmp_path):
-    """The virtual camera's own numbers, by a plan of a scene."""
-    virtual = VirtualRig(Coloured(), display_shape=(8, 8))
-    drivers = {"camera": ("usb3_vision", {}), "display": ("sdl", {})}
-    given = {"exposures": (0.02, 0.05, 0.1), "frames": 6, "dark_frames": 6}
-    plan = scene(WHITE, CameraSettings(0.1, pixel_format="BayerRG12"), **given)
-    with open_rig(drivers, 1.0, virtual=virtual) as rig:
-        acquire(plan, rig, tmp_path / "store")
-    found = Acquisition.load(tmp_path / "store")
-    sensor = measure_sensor(found.exposed(), full_scale=2**found.bits - 1, mosaic=True)
-    truth = Electronics()
-    electron = truth.scale(found.settings[0])[0]
-    assert abs(sensor.conversion_gain - electron) < 4 * sensor.conversion_gain_error
-    assert abs(sensor.read_noise - truth.read_noise) < 4 * sensor.read_noise_error
-    assert np.mean(sensor.dark_level) == pytest.approx(truth.offset, abs=0.1)
-    assert sensor.response.mean() == pytest.approx(1, abs=1e-3)
-    assert sensor.defective.mean() < 1e-3
 
 
 def test_hashes_of_plans_stay_as_they_were(tmp_path):

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.base import Region
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Busy,
     Disconnected,
     IncompleteFrame,
     NotFound,
     OutOfRange,
+    Region,
     Timeout,
 )
 from thincam_jax.hardware.registry import open_device

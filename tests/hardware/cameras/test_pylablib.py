@@ -11,13 +11,13 @@ import pytest
 from hardware.cameras import pylablib_double
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.base import Identity, Region
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Disconnected,
+    Identity,
     IncompleteFrame,
     NotFound,
     OutOfRange,
-    ProtocolError,
+    Region,
     Timeout,
 )
 from thincam_jax.hardware.registry import driver_report, open_device
@@ -255,15 +255,6 @@ def test_an_external_trigger_is_a_setting(kind):
         assert camera.trigger_and_grab(TIMEOUT).number == 1
     with pytest.raises(OutOfRange, match="no setting trigger_mod; give another name"):
         opened(settings={"trigger_mod": "ext"})
-
-
-def test_other_errors_of_a_camera(kind, camera):
-    def fails(*_, **__):
-        raise kind.Error("code 12")
-
-    camera._camera.start_acquisition = fails
-    with pytest.raises(ProtocolError, match="code 12; open the camera again"):
-        camera.trigger_and_grab(TIMEOUT)
 
 
 @pytest.mark.parametrize("name", ["", "Nowhere.Camera", "Dummy.Nothing", "Dummy.NoCamera"])

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.base import Region
-from thincam_jax.hardware.errors import Disconnected, IncompleteFrame, NotFound, OutOfRange, Timeout
+from thincam_jax.hardware.base import (
+    Disconnected,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    Region,
+    Timeout,
+)
 from thincam_jax.hardware.registry import open_device
-from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.devices import Faults
 from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
 from thincam_jax.hardware.virtual.rig import bits_of
 
@@ -102,11 +108,6 @@ def test_a_camera_that_renames_its_format_at_an_odd_place_is_seen(camera, monkey
     assert camera.configure(even).bayer == "RGGB"
     with pytest.raises(OutOfRange, match="its format is BayerGR12; give an even top and left"):
         camera.configure(CameraSettings(1e-3, Region(2, 5, 8, 12), "BayerRG12"))
-
-
-def test_without_a_region_the_whole_sensor(camera):
-    assert camera.configure(CameraSettings(1e-3)).region == Region(0, 0, *SENSOR)
-    assert camera.trigger_and_grab(TIMEOUT).pixels.shape == SENSOR
 
 
 @pytest.mark.parametrize(

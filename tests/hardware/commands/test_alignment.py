@@ -91,11 +91,3 @@ def test_files_that_do_not_fit(file, asked, line):
 def test_an_alignment_that_cannot_be_read(file):
     line = one_line(call("capture", file, *pictures("none.json")))
     assert "none.json" in line
-
-
-@pytest.mark.thorough
-def test_marks_outside_the_field_are_not_found(file):
-    store, moved = file.with_name("c.zarr"), "virtual.monitor.x=200 mm"
-    assert call("capture", file, "--out", store, "--set", moved).exit_code == 0
-    line = one_line(call("run", store, "--out", file.with_name("c")))
-    assert "0 of 9 marks were found and 0 lie within 0.846 mm of a homography" in line

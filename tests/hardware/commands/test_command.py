@@ -1,15 +1,9 @@
 """`thincam capture` on the virtual rig, through the protocols of its devices, and `thincam run`."""
 
-import errno
-import fcntl
 import importlib.metadata
 import json
-import os
-import signal
-import stat
 import sys
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,15 +12,12 @@ from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 from hardware.commands import tiny
 
-from helpers import ROOT, read_fiducial, recipe
-from thincam_jax.commands.checked_config import load_as
+from helpers import read_fiducial, recipe
 from thincam_jax.hardware import registry
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.commands import command
-from thincam_jax.hardware.commands.config import CaptureConfig
 from thincam_jax.hardware.displays.patterns import pattern_levels
 from thincam_jax.hardware.registry import driver_report
-from thincam_jax.hardware.virtual import devices
 from thincam_jax.hardware.virtual.rig import pattern_number
 from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.measured.calibration.system_matrix import open_matrix, read_matrix
@@ -136,53 +127,6 @@ def test_a_store_is_not_written_over_and_a_missing_one_begun(method_b, tmp_path)
     assert call("capture", file, "--out", store, "--resume").exit_code == 0  # complete already
 
 
-@pytest.mark.thorough
-def test_after_ctrl_c_the_store_is_kept_and_goes_on(method_b, tmp_path, monkeypatch):
-    """With the same frames as a capture that was not interrupted."""
-    file, whole = method_b
-    shown = []
-    present = devices.VirtualDisplay.show
-
-    def interrupted(display, pattern):
-        present(display, pattern)
-        shown.append(1)
-        if len(shown) == 3:  # the first one is not shown again
-            signal.raise_signal(signal.SIGINT)
-
-    store = tmp_path / "b.zarr"
-    with monkeypatch.context() as patch:
-        patch.setattr(devices.VirtualDisplay, "show", interrupted)
-        result = call("capture", file, "--out", store)
-    assert result.exit_code == 130
-    (line,) = result.stderr.splitlines()
-    assert "interrupted; 3 of 6 frames are kept; go on with: thincam capture" in line
-    assert line.endswith(f"--out {store} --resume")
-    assert call("capture", file, "--out", store, "--resume").exit_code == 0
-    first, second = Acquisition.load(whole), Acquisition.load(store)
-    steps = range(len(first.plan.steps))
-    assert all(np.array_equal(first.frame(n), second.frame(n)) for n in steps)
-
-
-@pytest.mark.thorough
-def test_the_exposure_is_found_before_the_first_frame_and_kept(tmp_path):
-    """From three times too long a start; the same when it goes on."""
-    raw = yaml.safe_load(tiny.METHOD_B) | {"acquisition": {"exposure": "auto"}}
-    raw["camera"]["exposure"] = "150 ms"
-    file, store = tiny.write(tmp_path, yaml.safe_dump(raw)), tmp_path / "a.zarr"
-    result = call("capture", file, "--out", store)
-    assert result.exit_code == 0, result.output
-    taken = Acquisition.load(store)
-    exposure = taken.settings[0].exposure
-    assert f"6 frames; exposure {1000 * exposure:.4g} ms; next: thincam run" in " ".join(
-        result.stdout.split()
-    )
-    level = np.quantile(taken.frame(taken.lit[0]), 0.999) / 4095
-    assert exposure < 0.1 and level == pytest.approx(0.7, rel=0.15)
-    assert all(shot["exposure"] == pytest.approx(exposure, rel=1e-3) for shot in taken.shots)
-    assert call("capture", file, "--out", store, "--resume").exit_code == 0
-    assert Acquisition.load(store).settings[0].exposure == exposure
-
-
 def test_an_error_of_a_device_is_one_line_and_how_to_go_on(tmp_path):
     file = tiny.write(tmp_path)
     store = tmp_path / "a.zarr"
@@ -226,62 +170,6 @@ def test_the_limits_of_a_rig_hold_for_the_whole_plan_before_the_first_frame(aske
     result = call("capture", file, "--out", store, "--set", asked)
     (told,) = result.stderr.splitlines()
     assert result.exit_code == command.STOPPED and line in told and not store.exists()
-
-
-@pytest.mark.parametrize(
-    ("asked", "line"),
-    [
-        ("plan.betas=[25 rad/mm^2]", "plan.betas: method_b compares two β"),
-        ("plan.cells=[8, 8]", "plan.cells: a plan of kind method_b takes betas, width, profile"),
-        ("plan.kind=method_a", "plan.distances: a plan of kind method_a needs it"),
-        ("plan.kind=hadamard", "plan.cells: a plan of kind hadamard needs it"),
-        ("virtual=null", "virtual: rig: virtual needs this section"),
-        ("targets=[]", "targets: a virtual rig looks at one; give it"),
-        ("optics=null", "optics: a plan of kind method_b needs optics"),
-    ],
-)
-def test_a_file_that_does_not_fit_together(asked, line, tmp_path):
-    file = tiny.write(tmp_path)
-    assert line in one_line(call("capture", file, "--set", asked))
-
-
-def test_files_go_to_the_command_that_takes_them(tmp_path):
-    assert "give it to 'thincam capture'" in one_line(call("run", tiny.write(tmp_path)))
-    assert "a store that thincam capture has completed" in one_line(call("run", tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("plan", "positions"),
-    [
-        ({"kind": "fringe_scan", "dark_frames": 1}, [0.0] * 5),
-        ({"kind": "method_a", "distances": ["5 mm", "6.5 mm"]}, [-1.5] * 4 + [0.0] * 4),
-        ({"kind": "psf_stack", "distances": ["16.5 mm"], "phase": "1 rad"}, [10.0]),
-    ],
-)
-def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, tmp_path):
-    raw = yaml.safe_load(tiny.METHOD_B)
-    raw |= {"stage": {"driver": "zaber"}}
-    raw["plan"] = {"betas": ["25 rad/mm^2"], "width": "1.44 mm", **plan}
-    config = load_as(CaptureConfig, tiny.write(tmp_path, yaml.safe_dump(raw)))
-    assert [step.position for step in command.build_plan(config).steps] == positions
-
-
-@pytest.mark.parametrize(
-    ("name", "steps"),
-    [
-        ("rig_virtual", 5),
-        ("rig_hadamard", 1032),
-        ("rig_pictures", 8),
-        ("rig_scene", 24),
-        ("rig_colour", 8),
-        ("rig_alignment", 14),
-        ("rig_phase", 4),
-    ],
-)
-def test_shipped_files(name, steps):
-    config = load_as(CaptureConfig, ROOT / "configs" / f"{name}.yaml")
-    plan = command.build_plan(config)
-    assert len(plan.steps) == steps
 
 
 PLUG_IN = recipe("a device")
@@ -348,56 +236,6 @@ def test_a_broken_camera_of_another_package_is_told_of(code, cause, tmp_path, mo
     assert result.exit_code == command.STOPPED and f"broken ({cause}" in told
 
 
-def test_nothing_listens_and_no_other_user_reaches_a_device(tmp_path):
-    """The sockets of this process are the same with the devices open, and a pseudo-terminal is its
-    user's alone, behind a folder of a name that cannot be guessed."""
-    raw = yaml.safe_load(tiny.METHOD_B)
-    config = load_as(
-        CaptureConfig, tiny.write(tmp_path, yaml.safe_dump({**raw, "stage": {"driver": "zaber"}}))
-    )
-    before = sockets()
-    with devices.VirtualDevices(command.virtual_rig(config)) as virtual:
-        stage, camera = virtual.stage("zaber"), virtual.camera("usb3_vision")
-        virtual.camera("pylon").close()
-        try:
-            assert sockets() == before
-            port = Path(virtual._there["stage"].port)
-            assert stat.S_IMODE(port.parent.stat().st_mode) == 0o700
-            terminal = port.resolve()
-            mode = stat.S_IMODE(terminal.stat().st_mode)
-            assert not mode & (stat.S_IRWXO | stat.S_IRGRP), oct(mode)
-            assert terminal.stat().st_uid == os.getuid()
-            assert opened_by_one_only(terminal)
-        finally:
-            stage.close()
-            camera.close()
-    assert not port.exists()
-
-
-def opened_by_one_only(terminal):
-    """Whether a second opening is refused; root's is not, but sees that it would be."""
-    try:
-        handle = os.open(terminal, os.O_RDWR | os.O_NOCTTY)
-    except OSError as error:
-        return error.errno == errno.EBUSY
-    exclusive = fcntl.ioctl(handle, 0x80045440, bytes(4))  # TIOCGEXCL
-    os.close(handle)
-    return int.from_bytes(exclusive, sys.byteorder) == 1
-
-
-def sockets():
-    """The inodes of this process' sockets that listen or are bound to an address of a network."""
-    own = set()
-    for handle in Path("/proc/self/fd").iterdir():
-        try:
-            name = os.readlink(handle)
-        except OSError:
-            continue
-        if name.startswith("socket:["):
-            own.add(name[8:-1])
-    found = set()
-    for table in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
-        path = Path("/proc/self/net", table)
-        lines = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
-        found |= {inode for line in lines if (inode := line.split()[9]) in own}
-    return found
+def test_files_go_to_the_command_that_takes_them(tmp_path):
+    assert "give it to 'thincam capture'" in one_line(call("run", tiny.write(tmp_path)))
+    assert "a store that thincam capture has completed" in one_line(call("run", tmp_path))

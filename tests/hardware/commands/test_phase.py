@@ -11,10 +11,9 @@ from commands.test_cli import call, one_line
 from hardware.commands import tiny
 
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.hardware.commands import command
 from thincam_jax.hardware.commands.config import CaptureConfig
 from thincam_jax.hardware.commands.run import picture_levels
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 
 PHASES = (0.0, 0.7, 2.8, 4.9, 5.65)
 TABLE = {"phases": [f"{phase} rad" for phase in PHASES], "wavelength": "532 nm", "gap": 0.5}
@@ -50,23 +49,6 @@ def test_frames_are_those_of_the_phases_shown(file):
 
 
 OTHER = "{phases: [0 rad, 6.26 rad], wavelength: 532 nm}"
-
-
-def test_a_table_of_a_file_is_the_same_and_another_one_another_plan(file, tmp_path):
-    table = PhaseLevels(PHASES, 532e-6, gap=0.5)
-    table.save(tmp_path / "slm.json")
-    here, there = (
-        loaded(file, *sets) for sets in ((), (f"display.phase_levels={tmp_path / 'slm.json'}",))
-    )
-    assert here.display.phase_levels == there.display.phase_levels
-    plan = command.build_plan(here)
-    assert plan.hash == command.build_plan(there).hash
-    assert [plan.pattern(step).kind for step in plan.steps] == ["pixels"] * 2 + ["black"] * 2
-    other = loaded(file, "display.phase_levels.phases.1=0.9 rad")
-    assert plan.hash != command.build_plan(other).hash
-    stack = "plan={kind: psf_stack, distances: [6 mm, 7 mm]}", "stage={driver: zaber}"
-    moved = command.build_plan(loaded(file, *stack))
-    assert [moved.pattern(step).kind for step in moved.steps] == ["pixels"] * 2
 
 
 def test_phases_of_files(file, tmp_path):

@@ -70,16 +70,6 @@ def test_pictures_come_back(home):
     assert there["TV"]["targets"] == scores["TV"]["targets"]
 
 
-@pytest.mark.thorough
-def test_a_changed_picture_is_another_plan(home):
-    other = np.full((8, 16), 30, np.uint8)
-    other[0, 0] = 255
-    skimage.io.imsave(home / "other.png", other, check_contrast=False)
-    change = "targets=[{name: bars, kind: file, path: other.png}]"
-    args = ("capture", "pictures.yaml", "--out", "pictures.zarr", "--resume", "--set", change)
-    assert "another plan" in one_line(call(*args))
-
-
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
@@ -119,12 +109,3 @@ def test_a_scene_comes_back_by_the_matrix(home):
         for path in ("seen/images/bars--tv.png", "real/images/scene--tv.png")
     ]
     np.testing.assert_array_equal(*images)
-
-
-@pytest.mark.thorough
-def test_a_matrix_of_other_cells_is_told_of(home):
-    text = (home / "pictures.zarr/config.yaml").read_text("utf-8")
-    store = home / "none.zarr"
-    shutil.copytree(home / "pictures.zarr", store)
-    (store / "config.yaml").write_text(text.replace("calibration.zarr", "nothing.zarr"), "utf-8")
-    assert "nothing.zarr" in one_line(call("run", "none.zarr", "--out", "x"))

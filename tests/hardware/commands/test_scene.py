@@ -10,10 +10,7 @@ from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 from hardware.commands import tiny
 
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.hardware.commands.command import build_plan
-from thincam_jax.hardware.commands.config import CaptureConfig
-from thincam_jax.hardware.displays.grey_levels import GreyLevels
+from thincam_jax.hardware.displays.levels import GreyLevels
 
 SCENE = yaml.safe_load(tiny.METHOD_B)
 SCENE["camera"]["exposure"] = "5 ms"
@@ -47,14 +44,6 @@ def test_merged_frames_are_those_of_a_direct_simulation(file):
     frame, variance = (tifffile.imread(out / f"{name}.tif") for name in ("scene", "variance"))
     assert frame.shape == variance.shape == (64, 96) and np.isfinite(variance).all()
     assert "exposure 5, 50 ms" in assert_says_its_result(out)
-
-
-def test_a_real_scene_needs_neither_display_nor_optics(tmp_path):
-    raw = {key: SCENE[key] for key in ("name", "kind", "camera")} | {"rig": "real"}
-    raw["plan"] = {"kind": "scene", "frames": 3}
-    config = load_as(CaptureConfig, tiny.write(tmp_path, yaml.safe_dump(raw)))
-    assert config.drivers["display"][0] == "shutter"
-    assert len(build_plan(config).steps) == 3
 
 
 @pytest.mark.thorough

@@ -6,7 +6,7 @@ import numpy as np
 
 from thincam_jax.hardware import Camera, CameraSettings
 from thincam_jax.hardware.base import Frame, Identity
-from thincam_jax.hardware.virtual.display import VirtualDisplay
+from thincam_jax.hardware.virtual.devices import VirtualDisplay
 
 
 class Clock:

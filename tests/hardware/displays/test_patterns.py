@@ -5,9 +5,8 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax.hardware.acquisition.plan import BLACK, Pattern
-from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
-from thincam_jax.hardware.plans import levels_pattern, pictures, zone_plate
+from thincam_jax.hardware.plans import zone_plate
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 PITCH = 0.036  # mm, the modulator of the thesis
@@ -53,14 +52,6 @@ def test_zones_are_those_of_the_formula(profile):
         assert set(np.unique(pattern)) == {0, 255}
 
 
-def test_a_printed_masks_pattern_and_its_complement():
-    mask = tc.FresnelZoneAperture(beta=12.0, phase=0.0, width=0.7, profile="intensity")
-    other = tc.FresnelZoneAperture(beta=12.0, phase=np.pi, width=0.7, profile="intensity")
-    both = [mask_pattern(m, SHAPE, PITCH).astype(int) for m in (mask, other)]
-    inner = slice(3, -3), slice(12, -12)
-    assert np.abs(sum(both)[inner] - 255).max() <= 1
-
-
 def test_cells_are_squares_of_pixels():
     mask = tc.SeparableMask([1, 0, 1], [0, 1, 1, 0.5], 4 * PITCH)
     expected = np.zeros(SHAPE)
@@ -83,16 +74,6 @@ def test_masks_that_do_not_fit(mask, pitch, message):
         mask_pattern(mask, SHAPE, pitch)
 
 
-def test_cells_are_the_largest_that_fit():
-    series = HadamardSeries(object_shape=(2, 8), dark_frames=1)
-    for number in range(series.frame_count):
-        expected = np.zeros(SHAPE)
-        expected[7:17] = np.kron(255 * series.frame(number), np.ones((5, 5)))
-        np.testing.assert_array_equal(on_cells(255 * series.frame(number), SHAPE), expected)
-    with pytest.raises(ValueError, match="do not fit into 24 × 40"):
-        on_cells(np.zeros((32, 32), np.uint8), SHAPE)
-
-
 def test_levels_of_the_patterns_of_a_plan():
     plate = zone_plate(12.0, 16 * PITCH, phase=0.4)
     mask = tc.FresnelZoneAperture(12.0, 0.4, width=16 * PITCH, pixel_pitch=PITCH)
@@ -104,29 +85,6 @@ def test_levels_of_the_patterns_of_a_plan():
     assert not pattern_levels(BLACK, SHAPE, PITCH).any()
     with pytest.raises(ValueError, match="kind 'own' has no levels"):
         pattern_levels(Pattern("own"), SHAPE, PITCH)
-
-
-def test_a_picture_is_the_one_of_the_plan():
-    picture = np.random.default_rng(0).integers(0, 256, (4, 8), np.uint8)
-    plan = pictures({"own": picture}, CameraSettings(exposure=0.01), frames=2, dark_frames=1)
-    assert [plan.pattern(step).kind for step in plan.steps] == ["black", "picture", "picture"]
-    shown = plan.pattern(plan.steps[1])
-    levels = pattern_levels(shown, SHAPE, PITCH, {"own": picture})
-    np.testing.assert_array_equal(levels[2:22], np.kron(picture, np.ones((5, 5))))
-    assert not levels[:2].any() and not levels[22:].any()
-    for other in ({}, {"own": picture ^ 1}, {"own": picture.reshape(8, 4)}):
-        with pytest.raises(ValueError, match="the picture 'own' is not the one of the plan"):
-            pattern_levels(shown, SHAPE, PITCH, other)
-
-
-def test_levels_of_pixels_are_in_the_middle_one_to_one():
-    levels = np.random.default_rng(0).integers(0, 256, (6, 9), np.uint8)
-    pattern = levels_pattern("lens", levels)
-    shown = pattern_levels(pattern, SHAPE, PITCH, {"lens": levels})
-    np.testing.assert_array_equal(shown[9:15, 15:24], levels)
-    assert shown.sum() == levels.sum(dtype=int) and pattern.label == "lens"
-    with pytest.raises(ValueError, match="6 × 9 cells do not fit into 5 × 40 pixels"):
-        pattern_levels(pattern, (5, 40), PITCH, {"lens": levels})
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (41, 61)])

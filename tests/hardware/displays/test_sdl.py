@@ -13,8 +13,7 @@ from hardware.displays.x_server import (
 )
 from PIL import Image
 
-from thincam_jax.hardware.displays.grey_levels import GreyLevels
-from thincam_jax.hardware.errors import Disconnected, NotFound, OutOfRange
+from thincam_jax.hardware.base import Disconnected, NotFound, OutOfRange
 from thincam_jax.hardware.registry import open_device
 
 SIZE = 24, 40
@@ -46,16 +45,6 @@ def test_every_pixel_is_presented_when_show_returns(folder):
             pattern = RANDOM.integers(0, 256, SIZE, dtype=np.uint8)
             display.show(pattern)
             assert np.array_equal(presented(folder), np.repeat(pattern[..., None], 3, axis=2))
-
-
-def test_grey_levels_of_a_file_are_applied(folder):
-    table = np.arange(255, -1, -1).astype(np.uint8)
-    GreyLevels(table, {}).save(folder / "levels.json")
-    options = {"size": SIZE, "grey_levels": str(folder / "levels.json")}
-    with open_device("displays", "sdl", options) as display:
-        pattern = RANDOM.integers(0, 256, SIZE, dtype=np.uint8)
-        display.show(pattern)
-        assert np.array_equal(presented(folder)[..., 0], 255 - pattern)
 
 
 def test_all_of_a_monitor_by_its_name_or_number(folder):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hardware.displays.rig import Clock, Panel, PanelCamera
 
+from thincam_jax.hardware.base import OutOfRange, Timeout
 from thincam_jax.hardware.displays import settle
 from thincam_jax.hardware.displays.settle import settle_calibrate
-from thincam_jax.hardware.errors import OutOfRange, Timeout
 
 SHAPE = 12, 20
 RESPONSE, LONGEST = 0.02, 0.2  # s

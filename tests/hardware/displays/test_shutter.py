@@ -1,6 +1,5 @@
 """A camera that is covered by hand for its dark frames."""
 
-import io
 import shutil
 import signal
 
@@ -13,11 +12,10 @@ from thincam_jax.hardware.acquisition.plan import WHITE
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.displays.patterns import pattern_levels
-from thincam_jax.hardware.displays.shutter import Shutter
-from thincam_jax.hardware.errors import NotFound
+from thincam_jax.hardware.displays.settle import Shutter
 from thincam_jax.hardware.plans import scene
 from thincam_jax.hardware.registry import open_device
-from thincam_jax.hardware.virtual.display import VirtualDisplay
+from thincam_jax.hardware.virtual.devices import VirtualDisplay
 
 
 @pytest.fixture
@@ -63,13 +61,6 @@ def test_a_resumed_run_does_not_take_the_camera_for_open(rig, tmp_path):
     assert rig[1] == ["cover the camera", "uncover the camera", "cover the camera"]
     taken = Acquisition.load(store)
     np.testing.assert_array_equal(taken.frame(2), taken.frame(0))
-
-
-def test_nobody_answers(monkeypatch):
-    shutter = open_device("displays", "shutter")
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-    with pytest.raises(NotFound, match="cover the camera: nobody answers at a terminal; begin it"):
-        shutter.show(np.zeros((1, 1), np.uint8))
 
 
 def test_before_a_phase_modulator_it_passes_all_but_black_on(monkeypatch):

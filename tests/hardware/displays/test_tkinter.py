@@ -8,7 +8,7 @@ import pytest
 from hardware.displays.x_server import SCREEN, needs_x_server, x_server
 
 from helpers import ROOT
-from thincam_jax.hardware.errors import NotFound
+from thincam_jax.hardware.base import NotFound
 from thincam_jax.hardware.registry import open_device
 
 pytest.importorskip("tkinter", reason="needs a Python with tkinter (Debian's python3-tk)")

@@ -6,9 +6,7 @@ import threading
 import pytest
 from stage_faults import STAGES
 
-from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import Busy, NotHomed, OutOfRange, ProtocolError, Timeout
-from thincam_jax.hardware.registry import open_device
+from thincam_jax.hardware.base import Busy, NotHomed, OutOfRange, ProtocolError, Timeout
 from thincam_jax.hardware.stages import serial_stage
 from thincam_jax.hardware.virtual.grbl import PULL_OFF
 from thincam_jax.hardware.virtual.serial_device import Motion
@@ -17,10 +15,6 @@ from thincam_jax.hardware.virtual.zaber import MICROSTEP
 FAST = Motion(travel=10.0, start=2.0, speed=1000.0)
 SLOW = Motion(travel=10.0, start=5.0, speed=20.0)
 STEP = 1e-3  # mm: a microstep, and the digits of GRBL's positions
-IDENTITIES = {
-    "zaber": Identity("Zaber", "device 50081", "12345", "7.38"),
-    "grbl": Identity("GRBL", "axis X", "virtual", "1.1h.20190830"),
-}
 
 
 @pytest.fixture(params=STAGES)
@@ -52,12 +46,6 @@ def slow(kind, connect):
     with STAGES[kind][1](SLOW) as device, connect(device) as stage:
         stage.home()
         yield device, stage
-
-
-def test_it_is_opened_by_name_and_names_itself(kind, device):
-    with open_device("stages", kind, {"port": str(device.port)}) as stage:
-        assert stage.identity == IDENTITIES[kind]
-        assert stage.limits == (0.0, pytest.approx(10.0, abs=STEP))
 
 
 @pytest.mark.parametrize(
@@ -109,21 +97,6 @@ def test_stopped_from_another_thread_it_returns_where_it_stands(slow):
     assert stage.homed and stage.move_to(5.0) == pytest.approx(5.0, abs=STEP)
 
 
-def test_too_slow_it_is_stopped(slow):
-    device, stage = slow
-    stage.move_to(5.0)
-    with pytest.raises(Timeout, match="not there within 0.05 s"):
-        stage.move_to(9.0, timeout=0.05)
-    stood = device.true_position
-    assert stage.position() == pytest.approx(stood, abs=STEP)
-    assert device.true_position == stood
-    with pytest.raises(Timeout):
-        stage.home(timeout=0.0)
-    assert not stage.homed  # it stopped half-way
-    stage.home()
-    assert stage.position() == pytest.approx(device.true_position, abs=STEP)
-
-
 def test_lost_steps_are_reported_until_it_is_homed(kind, device, stage):
     cause = {"zaber": r"it stalled and stopped \(FS\)",
              "grbl": r"its motor raised the alarm \(alarm 1\)"}[kind]  # fmt: skip
@@ -172,6 +145,21 @@ def test_late_answers_are_not_taken_for_those_to_later_commands(kind, connect):
             stage.move_to(3.0)
             device.faults.inject("latency")
             assert stage.move_to(7.0) == pytest.approx(device.true_position, abs=STEP)
+
+
+def test_too_slow_it_is_stopped(slow):
+    device, stage = slow
+    stage.move_to(5.0)
+    with pytest.raises(Timeout, match="not there within 0.05 s"):
+        stage.move_to(9.0, timeout=0.05)
+    stood = device.true_position
+    assert stage.position() == pytest.approx(stood, abs=STEP)
+    assert device.true_position == stood
+    with pytest.raises(Timeout):
+        stage.home(timeout=0.0)
+    assert not stage.homed  # it stopped half-way
+    stage.home()
+    assert stage.position() == pytest.approx(device.true_position, abs=STEP)
 
 
 @pytest.mark.parametrize(

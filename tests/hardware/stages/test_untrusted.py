@@ -8,7 +8,7 @@ from itertools import product
 import pytest
 from stage_faults import RIGHT, STAGES, campaign
 
-from thincam_jax.hardware.errors import ProtocolError
+from thincam_jax.hardware.base import ProtocolError
 from thincam_jax.hardware.stages.grbl import parse_line
 from thincam_jax.hardware.stages.zaber import checksum, parse_message
 from thincam_jax.hardware.virtual.zaber import parse_command

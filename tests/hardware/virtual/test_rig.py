@@ -10,12 +10,9 @@ import scipy
 import thincam_jax as tc
 from helpers import read_fiducial
 from thincam_jax.hardware import CameraSettings, registry
-from thincam_jax.hardware.base import Region
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
-from thincam_jax.hardware.errors import NotHomed, OutOfRange
+from thincam_jax.hardware.base import NotHomed, OutOfRange, Region
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.hardware.virtual.devices import VirtualDevices
-from thincam_jax.hardware.virtual.display import VirtualDisplay
-from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.optics import (
     ModulatorOptics,
     MonitorOptics,
@@ -25,7 +22,7 @@ from thincam_jax.hardware.virtual.optics import (
     cells_shown,
     pixelated_psf,
 )
-from thincam_jax.hardware.virtual.rig import Electronics, Fiducial, VirtualRig, pattern_number
+from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig, pattern_number
 from thincam_jax.imaging.operators import Matrix, Sparse
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.units import nm, um
@@ -64,10 +61,6 @@ def test_the_pixels_shown_are_the_mask_of_a_direct_simulation(fill_factor):
     assert np.linalg.norm(taken - direct) < 3e-3 * modulation
     assert np.linalg.norm(optics(shown_mask(0.9), 0.25) - direct) > 0.05 * modulation
     assert np.linalg.norm(optics(shown_mask(0.7), 0.0) - direct) > 0.02 * modulation
-
-
-def test_a_black_pattern_is_a_dark_frame():
-    assert not modulator()(np.zeros((48, 60), np.uint8), 0.0).any()
 
 
 def test_light_behind_phases_and_the_gaps_between_them_by_quadrature():
@@ -193,29 +186,6 @@ def test_counts_follow_the_exposure_with_their_noise_and_saturate():
     assert np.abs(eight - clean / 16).mean() < 4
 
 
-def test_a_region_and_a_repeated_exposure():
-    """The same pattern again has other noise; in another process it begins anew."""
-    taken, again = rig(), rig()
-    region = CameraSettings(0.001, Region(3, 5, 7, 11))
-    first, second = taken.expose(region), taken.expose(region)
-    assert first.shape == (7, 11)
-    assert not np.array_equal(first, second)
-    assert np.array_equal(again.expose(region), first)
-
-
-def test_a_frame_says_in_its_corner_what_it_was_exposed_of():
-    taken = rig(fiducial=True)
-    pattern = np.random.default_rng(3).integers(0, 255, (4, 8)).astype(np.uint8)
-    taken.on_show(pattern)
-    taken.on_move(-1.25)
-    for number in range(2):
-        found = read_fiducial(taken.expose(SETTINGS), 12)
-        assert found == Fiducial(pattern_number(pattern), -1250, number)
-    taken.on_show(255 - pattern)
-    last = read_fiducial(taken.expose(SETTINGS), 12)
-    assert last == Fiducial(pattern_number(255 - pattern), -1250, 0)
-
-
 def test_before_the_display_has_answered_the_pattern_before_is_seen(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
@@ -226,20 +196,6 @@ def test_before_the_display_has_answered_the_pattern_before_is_seen(monkeypatch)
     assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(black)
     now[0] += 0.02
     assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(white)
-
-
-def test_a_display_shows_late_where_that_fault_is_due():
-    shown, faults = [], Faults()
-    faults.inject("latency")
-    display = VirtualDisplay((4, 8), shown.append, faults=faults)
-    before = time.monotonic()
-    display.show(np.zeros((4, 8), np.uint8))
-    assert time.monotonic() - before > 0.04 and len(shown) == faults.happened["latency"] == 1
-
-
-def test_a_pattern_of_another_shape_is_refused():
-    with pytest.raises(ValueError, match=r"\(4, 8\)"):
-        rig().on_show(np.zeros((8, 4), np.uint8))
 
 
 def without_libraries(monkeypatch):

@@ -11,13 +11,12 @@ from helpers import ROOT, quick, relative_l2
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import assemble
 from thincam_jax.imaging.metrics.mtf import (
-    MINIMUM_COLUMNS,
     cut_off,
     first_common_zero,
     low_frequency_value,
     zero_crossings,
 )
-from thincam_jax.studies.response import method_response
+from thincam_jax.studies.result import method_response
 
 WAVELENGTH = 5e-4
 STEP = 0.05
@@ -160,16 +159,6 @@ def test_refuses_nothing_to_measure():
         first_common_zero(U, [])
 
 
-def test_minimum_columns_is_the_smallest_with_a_low_frequency():
-    def half(columns):
-        return np.fft.fftshift(np.fft.fftfreq(columns))[columns // 2 :]
-
-    for columns in (MINIMUM_COLUMNS, MINIMUM_COLUMNS + 1, MINIMUM_COLUMNS + 2):
-        assert low_frequency_value(half(columns), np.ones(len(half(columns)))) == 1.0
-    with pytest.raises(ValueError, match="more finely"):
-        low_frequency_value(half(MINIMUM_COLUMNS - 2), np.ones((MINIMUM_COLUMNS - 2) // 2))
-
-
 # The thesis' set-up (section 3.5.1): 1024² pixels of 5.5 µm, a mask of 5.632 mm, λ = 500 nm.
 CONVENTIONAL_5, CONVENTIONAL_6, METHOD_A, METHOD_B = range(4)
 
@@ -223,18 +212,6 @@ def test_phase_pairs_have_no_first_zero():
             assert response.magnitude[around].max() > 0.1 * level
 
 
-@pytest.mark.thorough
-def test_object_side_limits_are_the_sensor_side_ones_magnified():
-    limits = near(CONVENTIONAL_5).limits  # on its own plane: t/d = 50
-    assert limits.first_zero_object_mm == pytest.approx(
-        50 / limits.first_zero_cycles_per_mm, abs=1e-3
-    )
-    limits = near(METHOD_A).limits  # on the plane of the larger distance
-    assert limits.cut_off_object_mm == pytest.approx(
-        250 / 6.5 / limits.cut_off_cycles_per_mm, abs=1e-3
-    )
-
-
 def test_cut_off_of_method_a_is_the_aperture():
     """βR/π = 22.4 cycles/mm (ERRATA 3.5.1), and no zero at 22.9."""
     assert near(METHOD_A).limits.cut_off_cycles_per_mm == pytest.approx(22.4, abs=1.0)
@@ -251,22 +228,6 @@ def test_near_object_lowers_the_cut_off_by_the_magnification():
     """2βR/(πM²) for the part of the shadow on the sensor: 42.6 at the larger β."""
     limit = 2 * 25 / (1 + 6.5 / 250) ** 2 * 5.632 / 2 / math.pi
     assert near(METHOD_B).limits.cut_off_cycles_per_mm == pytest.approx(limit, abs=1.0)
-
-
-@pytest.mark.thorough
-def test_edge_tail_of_method_a_for_a_distant_object():
-    """Beyond βR/π the sharp edge of the aperture leaves a tail, and 5 % is inside it.
-
-    The end of a chirp falls to half at u_c = βR/π and then as 1/(√2 π s), where s is the Fresnel
-    parameter (u/u_c − 1)·R·√(2β/π): 5 % of it is reached only near 31 cycles/mm. Ten per cent,
-    above the tail of two distances, is passed within a Fresnel width of 22.4.
-    """
-    response = distant(METHOD_A)
-    edge = 25 * 2.816 / math.pi
-    width = edge / (2.816 * math.sqrt(2 * 25 / math.pi))  # Δu of s = 1
-    assert cut_off(response.frequency, response.magnitude, 0.1) == pytest.approx(edge, abs=width)
-    tail = edge * (1 + 1 / (math.sqrt(2) * math.pi * 0.05) / (edge / width))
-    assert edge + width < response.limits.cut_off_cycles_per_mm < tail
 
 
 def fields(beta, distance, x, half_width):
@@ -331,22 +292,3 @@ def _scaled(powers, like):
     """The root of the mean power, with the one free factor of a synthesis matrix fitted."""
     magnitude = np.sqrt(np.mean(powers, axis=0))
     return magnitude * (magnitude @ like) / (magnitude @ magnitude)
-
-
-@pytest.mark.thorough
-def test_rows_belong_to_the_response():
-    """v = 0 sums over the rows: a strip of 64 would give another first zero."""
-    (whole,) = responses(1e6, (CONVENTIONAL_5,))
-    (strip,) = responses(1e6, (CONVENTIONAL_5,), **{"sensor.shape": "[64, 1024]"})
-    zeros = [response.limits.first_zero_cycles_per_mm for response in (whole, strip)]
-    assert abs(zeros[0] - zeros[1]) > 0.2
-
-
-@pytest.mark.thorough
-def test_both_cut_offs_of_an_object_at_350_mm():
-    """Far enough for the sensor to pass most of the magnified shadow, near enough for it to cut the
-    tail of the aperture's edge: method A ends at βR/π and method B above 42 in one set-up.
-    """
-    method_a, method_b = responses(350, (METHOD_A, METHOD_B))
-    assert method_a.limits.cut_off_cycles_per_mm == pytest.approx(22.4, abs=1.0)
-    assert method_b.limits.cut_off_cycles_per_mm >= 42

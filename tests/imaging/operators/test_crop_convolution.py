@@ -5,9 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.signal
 
-from helpers import count_traces, finite_difference, quick
+from helpers import finite_difference, quick
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid, kernel_shape
@@ -84,30 +83,6 @@ def test_nothing_wraps_round(corner):
     expected[row : row + 3, column : column + 3] = kernel[4:7, 7:10]
     value = seen(operator(kernel, sensor, field, pitch=1.0), jnp.asarray(f))
     np.testing.assert_allclose(value, expected[1:-1, 1:-1], atol=1e-14)
-
-
-def test_kernel_grid_covers_every_difference():
-    grid = kernel_grid(Grid((4, 7), PITCH), (9, 6))
-    assert grid.shape == (12, 12)
-    # from the first sensor pixel to the last field sample
-    np.testing.assert_allclose(grid.y[0], -(3 / 2 + 8 / 2) * PITCH)
-    np.testing.assert_allclose(grid.x[-1], (6 / 2 + 5 / 2) * PITCH)
-
-
-def test_compiled_once_for_all_kernels():
-    sensor, field = (6, 9), (3, 4)
-
-    def blur(kernel, pitch, f):
-        return CropConvolution(kernel, pitch, sensor, field)(f)
-
-    counted = count_traces(blur)
-    compiled = jax.jit(counted)
-    for seed, pitch in ((0, 0.05), (1, 0.06)):
-        kernel = jnp.asarray(numbers(kernel_shape(sensor, field), seed))
-        f = jnp.asarray(numbers(field, seed))
-        expected = pitch**2 * scipy.signal.convolve(kernel, f, mode="valid")
-        np.testing.assert_allclose(compiled(kernel, jnp.asarray(pitch), f), expected, atol=1e-15)
-    assert counted.traces == 1
 
 
 def test_gradients():

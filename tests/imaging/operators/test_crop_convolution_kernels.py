@@ -184,12 +184,3 @@ def test_bad_sizes():
         CropConvolution(kernel, PITCH, (0, 8), (6, 11))
     with pytest.raises(ValueError, match="field_shape = .* is not a pair"):
         CropConvolution(kernel, PITCH, (5, 8), (6, 11, 3))
-
-
-def test_single_precision(key):
-    kernel = jnp.asarray(numbers((3, 4, 6)), jnp.float32)
-    convolution = operator(kernel, (5, 8), (6, 11), summed=1)
-    field = jnp.asarray(numbers((3, 6, 11), 1), jnp.float32)
-    value, error = seen_and_error(convolution, field, key)
-    assert value.dtype == jnp.float32
-    assert error < 3e-6

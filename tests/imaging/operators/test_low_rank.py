@@ -7,7 +7,6 @@ import pytest
 
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.reconstruction.scaled_problem import MARGIN
 
@@ -88,14 +87,6 @@ def test_even_psfs_are_centred_on_their_middle_pixel():
     )
     image = jax.random.uniform(jax.random.key(5), FIELD)
     np.testing.assert_allclose(even(image), odd(image), atol=1e-12)
-
-
-def test_adjoint_and_batches():
-    operator = low_rank_psf(grid((5, 7)), PITCH, SENSOR, FIELD, tolerance=0.03).operator
-    assert adjoint_error(operator, jax.random.key(3)) < 1e-14
-    images = jax.random.uniform(jax.random.key(4), (2, 3, *FIELD))
-    one_by_one = [[operator(image) for image in row] for row in images]
-    np.testing.assert_allclose(operator(images), one_by_one, atol=1e-13)
 
 
 @pytest.mark.parametrize(

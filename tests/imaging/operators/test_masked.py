@@ -50,16 +50,6 @@ def test_everything_masked_has_norm_zero():
     assert Masked(matrix(), False).norm() == 0
 
 
-def test_masks_of_several_captures():
-    """A tuple of masks, or one for all."""
-    captures = stack()(jnp.asarray(numbers(IN, 3)))
-    other = numbers((6, 2), 4) > 0
-    for given, masks in (((VALID, other), (VALID, other)), (VALID[0], (VALID[0], VALID[0]))):
-        value = Masked(stack(), given)(jnp.asarray(numbers(IN, 3)))
-        for seen, capture, mask in zip(value, captures, masks, strict=True):
-            np.testing.assert_array_equal(seen, np.where(mask, capture, 0))
-
-
 @pytest.mark.parametrize(
     "gain", [3, -0.5, numbers(OUT, 1), numbers((5, 1), 1), numbers(2, 1), [2, 3]]
 )
@@ -83,14 +73,6 @@ def test_gains_of_several_captures():
             np.testing.assert_allclose(seen, gain * np.asarray(capture), atol=1e-14)
 
 
-def test_norm_of_one_gain_is_exact():
-    separable = Separable(numbers((6, 3), 1), numbers((2, 4), 2))
-    np.testing.assert_allclose(Scaled(separable, -2).norm(), 2 * separable.norm(), rtol=1e-15)
-    assert Scaled(separable, 0).norm() == 0
-    single = Scaled(Separable(np.ones((6, 3), np.float32), np.ones((2, 4), np.float32)), 2.0)
-    assert single.norm().dtype == jnp.float32
-
-
 def test_slope_in_the_gain():
     """∂ ½‖c·Bf‖² = c·(Bf)²."""
     f, gain = jnp.asarray(numbers(IN, 1)), jnp.asarray(numbers((5, 1), 2))
@@ -99,12 +81,6 @@ def test_slope_in_the_gain():
     np.testing.assert_allclose(
         slope.gain, gain * np.sum(seen**2, axis=1, keepdims=True), rtol=1e-12
     )
-
-
-def test_a_gain_takes_the_precision_of_the_capture():
-    operator = Scaled(Matrix(H.astype(np.float32), IN, OUT), numbers(OUT))
-    assert operator(jnp.ones(IN, jnp.float32)).dtype == jnp.float32
-    assert operator.adjoint(jnp.ones(OUT, jnp.float32)).dtype == jnp.float32
 
 
 def test_bad_masks():

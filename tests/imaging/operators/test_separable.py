@@ -28,13 +28,6 @@ def test_sums(out, image):
     np.testing.assert_allclose(operator.adjoint(jnp.asarray(g)), back, atol=1e-13)
 
 
-def test_norm_is_exact():
-    out, image = SIZES[1]
-    left, right = numbers((out[0], image[0]), 1), numbers((out[1], image[1]), 2)
-    singular = np.linalg.svd(np.kron(left, right), compute_uv=False)
-    np.testing.assert_allclose(Separable(left, right).norm(), singular[0], rtol=1e-12)
-
-
 @pytest.mark.parametrize("image", [(3, 40), (40, 3)])
 def test_products_in_the_cheaper_order(image):
     """The few rows or columns of the image grow to the many of the capture last."""

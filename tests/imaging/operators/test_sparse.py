@@ -10,7 +10,6 @@ from imaging.operators.dense import IN, OUT, dense, numbers, sparse_matrix
 from jax.experimental import sparse
 
 from thincam_jax.imaging.operators import Sparse
-from thincam_jax.imaging.operators.base import adjoint_error
 
 FORMATS = ["coo", "csr", "csc", "lil", "dia", "bsr"]
 
@@ -72,20 +71,6 @@ def test_slope_in_the_values():
         slope = eqx.filter_grad(loss)(operator)
         expected = g.ravel()[operator.rows] * f.ravel()[operator.columns]
         np.testing.assert_allclose(slope.values, expected, atol=1e-14)
-
-
-def test_an_empty_matrix(key):
-    operator = Sparse(scipy.sparse.coo_array((10, 12)), IN, OUT)
-    assert operator.norm() == 0
-    assert adjoint_error(operator, key) == 0
-    np.testing.assert_array_equal(operator(jnp.ones((2, *IN))), np.zeros((2, *OUT)))
-
-
-def test_whole_numbers_and_single_precision():
-    whole = scipy.sparse.coo_array(np.eye(10, 12, k=1, dtype=int))
-    assert Sparse(whole, IN, OUT).values.dtype == jnp.float64
-    single = Sparse(whole.astype(np.float32), IN, OUT)
-    assert single(jnp.ones(IN, jnp.float32)).dtype == jnp.float32
 
 
 def test_a_batch_does_not_hold_all_products():

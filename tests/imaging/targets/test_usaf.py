@@ -17,19 +17,6 @@ def box(element):
     return y - half, y + half, x - half, x + half
 
 
-def crop(image, element, pixels_per_chart, periods=3):
-    """That many periods of the profile across the bars, and its spread along their inner part."""
-    (y, x), bar = element.centre, element.bar * pixels_per_chart
-    if element.orientation == "horizontal":
-        image, y, x = image.T, x, y
-    rows, columns = image.shape
-    middle = y * pixels_per_chart + rows / 2
-    start = round(x * pixels_per_chart + columns / 2 - 2.5 * bar)
-    band = image[round(middle - 2 * bar) : round(middle + 2 * bar)]
-    band = band[:, start : start + round(2 * bar * periods)]
-    return band.mean(axis=0), np.ptp(band, axis=0).max()
-
-
 def test_layers_hold_an_even_and_an_odd_group_in_both_orientations():
     elements = usaf1951_elements(layers=2)
     labels = {(e.group, e.element, e.orientation) for e in elements}
@@ -47,21 +34,6 @@ def test_standard_line_pairs():
         assert found[label] == pytest.approx(frequency, rel=3e-3)
     for (group, element), frequency in found.items():
         assert frequency == pytest.approx(2 ** (group + (element - 1) / 6), rel=1e-12)
-
-
-def test_line_pair_scales_with_the_chart():
-    element = usaf1951_elements()[0]
-    assert line_pair(element, 10.0) == pytest.approx(2 * element.bar * 10.0)
-    with pytest.raises(ValueError, match="width = 0"):
-        line_pair(element, 0)
-
-
-def test_first_group_only_labels():
-    standard, other = usaf1951_elements(2), usaf1951_elements(2, first_group=4)
-    assert [(e.centre, e.bar) for e in standard] == [(e.centre, e.bar) for e in other]
-    assert [e.group + 6 for e in standard] == [e.group for e in other]
-    with pytest.raises(ValueError, match="first_group = 1"):
-        usaf1951_elements(2, first_group=1)
 
 
 def test_nothing_overlaps_and_a_margin_stays_free():
@@ -91,29 +63,6 @@ def test_the_layout_is_the_standard_one():
     assert max(b[1] for b in inner) < max(b[0] for b in outer)
 
 
-def test_the_next_layer_is_the_same_a_quarter_as_large():
-    elements = usaf1951_elements(2)
-    outer, inner = elements[:24], elements[24:]
-    shifts = np.array(
-        [np.subtract(b.centre, np.divide(a.centre, 4)) for a, b in zip(outer, inner, strict=True)]
-    )
-    assert np.allclose(shifts, shifts[0], atol=1e-15)
-    assert [b.bar * 4 for b in inner] == pytest.approx([a.bar for a in outer], rel=1e-14)
-
-
-@pytest.mark.parametrize("shape", [(101, 237), (240, 67), (333, 334), (64, 65)])
-@pytest.mark.parametrize("layers", [1, 3])
-def test_total_is_the_area_of_the_bars(shape, layers):
-    """Three bars of w by 5w in each set, and a square of 5 by 5 bars in each layer."""
-    bars = sum(15 * e.bar**2 for e in usaf1951_elements(layers))
-    squares = sum((5 / 32 / 4**layer) ** 2 for layer in range(layers))
-    area = (bars + squares) * min(shape) ** 2
-    assert usaf1951(shape, layers=layers).sum() == pytest.approx(area, rel=1e-12)
-    dark = usaf1951(shape, layers=layers, polarity="dark_on_bright")
-    assert dark.sum() == pytest.approx(shape[0] * shape[1] - area, rel=1e-12)
-    assert dark[0, 0] == 1.0
-
-
 def test_the_centroid_is_that_of_the_elements():
     """Pixel centres at (i - (n-1)/2): the first moment along each axis, at odd and even sizes.
 
@@ -133,34 +82,6 @@ def test_the_centroid_is_that_of_the_elements():
 
 
 @pytest.mark.parametrize(
-    "element", usaf1951_elements(1), ids=lambda e: f"{e.group},{e.element},{e.orientation}"
-)
-def test_the_spectrum_of_a_set_peaks_at_its_frequency(element):
-    """With bars of 8 pixels, three periods of the profile are 48 pixels, at any sub-pixel shift."""
-    width = 8 / element.bar
-    image = usaf1951((round(width) + 1, round(width) + 20), layers=1, pixels_per_chart=width)
-    profile, along = crop(image, element, width)
-    spectrum = np.abs(np.fft.rfft(profile - profile.mean()))
-    stated = 2 ** (element.group + (element.element - 1) / 6) * STANDARD_WIDTH / width
-    assert np.argmax(spectrum) / 48 == pytest.approx(stated, rel=1e-9)
-    assert spectrum[3] / 48 == pytest.approx(1 / np.pi, rel=0.02)  # a square wave of duty 1/2
-    assert along == pytest.approx(0.0, abs=1e-12)  # constant along the bars
-
-
-def test_bars_of_element_1_lie_on_whole_pixels():
-    image = usaf1951((512, 600), layers=3)
-    profile, _ = crop(image, usaf1951_elements(3)[24], 512)
-    assert profile[:20].tolist() == ([1.0] * 4 + [0.0] * 4) * 2 + [1.0] * 4
-
-
-def test_pixels_per_chart_only_scales():
-    """A chart of 96 pixels in a larger image is the chart of 96 pixels with a border."""
-    large = usaf1951((120, 150), layers=2, pixels_per_chart=96)
-    assert np.allclose(large[12:-12, 27:-27], usaf1951((96, 96), layers=2), atol=1e-12)
-    assert large.sum() == pytest.approx(large[12:-12, 27:-27].sum())
-
-
-@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"shape": (0, 5)}, "shape"),
@@ -172,3 +93,11 @@ def test_pixels_per_chart_only_scales():
 def test_errors_name_the_argument(arguments, message):
     with pytest.raises(ValueError, match=message):
         usaf1951(**arguments)
+
+
+def test_first_group_only_labels():
+    standard, other = usaf1951_elements(2), usaf1951_elements(2, first_group=4)
+    assert [(e.centre, e.bar) for e in standard] == [(e.centre, e.bar) for e in other]
+    assert [e.group + 6 for e in standard] == [e.group for e in other]
+    with pytest.raises(ValueError, match="first_group = 1"):
+        usaf1951_elements(2, first_group=1)

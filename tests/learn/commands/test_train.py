@@ -100,11 +100,6 @@ def test_a_fault_of_the_file_is_told(changed, told, file):
         load_as(LearnedConfig, file, (changed,))
 
 
-def test_a_file_of_another_kind_is_told_as_that_alone():
-    told = line(call(ROOT / "configs" / "fza_refocus.yaml"))
-    assert told.endswith(".yaml: is a refocusing; give it to 'thincam run'")
-
-
 def test_the_shipped_file_is_whole():
     config = load_as(LearnedConfig, ROOT / "configs" / "learned_refocus.yaml")
     assert build_camera(config).planes == 7

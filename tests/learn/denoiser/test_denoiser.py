@@ -71,15 +71,6 @@ def test_gradients(network, image):
     assert float(along) == pytest.approx(float(finite_difference(value, given, ways, 1e-7)), 1e-5)
 
 
-def test_new_values_are_not_compiled_again(network, image):
-    one = Denoiser(network)(image, 0.1)
-    programs = room._denoised._cached._cache_size()
-    Denoiser(jax.tree.map(lambda leaf: 2 * leaf, network))(2 * image, 0.2)
-    assert room._denoised._cached._cache_size() == programs
-    mapped = jax.vmap(Denoiser(network), (0, None))(image, 0.1)
-    assert relative_l2(mapped, one) < 1e-12
-
-
 @pytest.mark.parametrize(
     ("image", "sigma", "told"),
     [
@@ -140,12 +131,6 @@ def test_options_of_a_file_that_are_not_to_be_trusted(widths, blocks, network, t
     with pytest.raises(CheckpointError, match="options of another version") as told:
         Denoiser.load(file)
     assert len(str(told.value)) < 500
-
-
-@pytest.mark.parametrize("wrong", [((), ()), ((4, 6), (1,)), ((0,), (1,)), ((4,), (-1,))])
-def test_sizes_that_do_not_fit_are_told(wrong):
-    with pytest.raises(ValueError, match="give"):
-        DenoiserOptions(*wrong)
 
 
 def test_untrained_it_changes_nothing(image):

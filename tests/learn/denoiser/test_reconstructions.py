@@ -9,12 +9,12 @@ import pytest
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax import learn
-from thincam_jax.learn.denoiser.drawn_cameras import drawn_kernels
 from thincam_jax.learn.denoiser.network import DenoiserOptions, create
 from thincam_jax.learn.denoiser.pictures import drawn
 from thincam_jax.learn.denoiser.reconstructions import (
     draw_cameras,
     draw_reconstructions,
+    drawn_kernels,
     reconstructed,
     reconstruction_loss,
 )

@@ -1,11 +1,18 @@
-"""Rows and columns that stand for all: what they weigh and where they lie."""
+"""Rows and columns that stand for all, norms by factors, and errors of sampled models."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import thincam_jax as tc
+from helpers import relative_l2
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.accuracy.lines import COUNT, SparseGrid, chosen
+from thincam_jax.lensless.accuracy.probe import distance, factors, norm, rounding_distance
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.lensless.propagation.separable import SeparableSum
+from thincam_jax.units import nm, um
 
 SEEDS = range(300)
 
@@ -85,3 +92,119 @@ def test_points_are_those_of_the_grid(factor):
     np.testing.assert_allclose(
         np.reshape(refined.x, (2, factor)), np.reshape(fine.x, (9, factor))[indices[1]], atol=1e-14
     )
+
+
+SHAPE = (17, 23)
+ONES = [np.ones(n) for n in SHAPE]
+
+
+def random_terms(seed, count=4):
+    rng = np.random.default_rng(seed)
+    values = [rng.normal(size=(count, n)) + 1j * rng.normal(size=(count, n)) for n in SHAPE]
+    return SeparableSum(*map(jnp.asarray, values), Grid(SHAPE, 0.01))
+
+
+def moved(terms, size, seed=9):
+    """Every factor changed by `size` of itself at random: what rounding does."""
+    rng = np.random.default_rng(seed)
+    change = [1 + size * rng.normal(size=v.shape) for v in (terms.rows, terms.columns)]
+    return SeparableSum(
+        terms.rows * change[0].astype(complex),
+        terms.columns * change[1].astype(complex),
+        terms.grid,
+    )
+
+
+def image(terms):
+    rows, columns = (np.asarray(v) for v in (terms.rows, terms.columns))
+    return np.einsum("ty,tx->yx", rows, columns).real
+
+
+def test_norm_and_distance():
+    first, second = random_terms(1), random_terms(2, count=6)
+    given = [factors(terms, *ONES) for terms in (first, second)]
+    assert norm(given[0]) == pytest.approx(np.linalg.norm(image(first)), rel=1e-13)
+    expected = np.linalg.norm(image(first) - image(second))
+    assert distance(*given) == pytest.approx(expected, rel=1e-13)
+    assert distance(given[0], given[0]) <= 1e-7 * norm(given[0])
+
+
+def test_weights_repeat_rows_and_columns():
+    """A weight of n is n equal rows; a weight of zero is none."""
+    terms = random_terms(3)
+    weights = [np.random.default_rng(n).integers(0, 4, n) for n in SHAPE]
+    repeated = np.repeat(np.repeat(image(terms), weights[0], axis=0), weights[1], axis=1)
+    given = factors(terms, *(w.astype(float) for w in weights))
+    assert norm(given) == pytest.approx(np.linalg.norm(repeated), rel=1e-13)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-8, 1e-14])
+def test_distance_of_nearly_equal_sums(size):
+    """Right in all sizes, where the distance of the images' norms has long lost its digits."""
+    first = random_terms(4)
+    second = moved(first, size)
+    given = [factors(terms, *ONES) for terms in (second, first)]
+    rows, columns = (np.asarray(v) for v in (first.rows, first.columns))
+    down, across = (np.asarray(v) - w for v, w in ((second.rows, rows), (second.columns, columns)))
+    # The differences of the factors are exact, so that those of the images keep their digits too.
+    change = np.einsum("ty,tx->yx", down, np.asarray(second.columns))
+    change = (change + np.einsum("ty,tx->yx", rows, across)).real
+    expected = np.linalg.norm(change)
+    assert 0 < expected < 100 * size * norm(given[1])
+    assert rounding_distance(*given) == pytest.approx(expected, rel=1e-6)
+    if size < 1e-10:
+        assert abs(distance(*given) / expected - 1) > 0.1
+
+
+WAVELENGTH = 532 * nm
+KEY = jax.random.key(11)
+BLANK = MaskBlank((40, 48), 5 * um, 1.5)
+
+
+def camera(name):
+    if name == "diffuser":
+        mask = diffuser(KEY, BLANK, correlation_length=20 * um, rms_slope=0.02)
+    elif name == "lenses":
+        mask = voronoi_fresnel(KEY, BLANK, sites=3, focal_length=4.0, wavelength=WAVELENGTH)
+    else:
+        mask = BLANK.mask(np.random.default_rng(0).uniform(0, 1e-3, (40, 48)))
+    return tc.LenslessCamera(mask, tc.Sensor((36, 40), 5 * um), 4.0)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("name", "average"),
+    [("diffuser", False), ("lenses", True), ("cells", False), ("lenses", False), ("cells", True)],
+)
+def test_predicted_errors_are_at_least_the_true_ones(name, average):
+    """Against 11 samples a pixel and a window of three times the width."""
+    here = camera(name)
+    light = {"wavelength": WAVELENGTH, "pixel_integration": average}
+    choice = tc.choose_model(here, tolerance=0.05 if name == "cells" else 0.02, **light)
+    assert choice.method.model == "angular_spectrum" and choice.meets_tolerance
+    finest = tc.PsfMethod("angular_spectrum", oversampling=11, mask_shape=(120, 128))
+    best = tc.psf(here, model=finest, **light)
+    for tried in choice.considered:
+        found = tc.psf(here, model=tried.method, **light)
+        true = relative_l2(found, best)
+        assert true < tried.predicted_error < 12 * true + 1e-6, (tried, true)
+    assert "has no exact PSF" in choice.reasons[0]
+
+
+@pytest.mark.thorough
+def test_a_choice_beyond_reach_says_so_and_traced_numbers_are_refused():
+    choice = tc.choose_model(
+        camera("diffuser"), wavelength=WAVELENGTH, tolerance=1e-9, pixel_integration=False
+    )
+    assert not choice.meets_tolerance
+    assert [p.method.oversampling for p in choice.considered] == [1, 3, 5, 7]
+    assert choice.predicted_error == choice.considered[-1].predicted_error
+    lenses = camera("lenses")
+    with pytest.raises(TypeError, match="the choice of a model needs known numbers"):
+        jax.jit(
+            lambda w: (
+                tc.choose_model(
+                    lenses, wavelength=w, tolerance=0.1, pixel_integration=False
+                ).cost.flops
+            )
+        )(jnp.asarray(WAVELENGTH))

@@ -177,45 +177,6 @@ def test_line_fields_of_a_slit(exact):
     assert relative_l2(np.abs(other) ** 2, np.abs(fine) ** 2) > 2e-2
 
 
-def test_numbers_of_the_thesis_camera():
-    """ε = βλd/(πM); its phases at the mask's edge; the edge zone in mm."""
-    magnification = 1 + 6.5 / 250
-    epsilon = 25 * 500e-6 * 6.5 / np.pi / magnification
-    numbers = probe_of(case_of((64, 48), 5.5e-3)).numbers()
-    phase = 25 * 2.816**2
-    assert numbers.epsilon == pytest.approx(epsilon)
-    assert numbers.first_order == pytest.approx(epsilon * phase)
-    assert numbers.second_order == pytest.approx(epsilon**2 * phase)
-    assert numbers.edge_zone == pytest.approx(np.sqrt(500e-6 * 6.5 / magnification))
-    # The far edge, seen from the sensor's other side: about π(w/2 + 32 pixels)²/(λd).
-    assert numbers.largest_phase == pytest.approx(np.pi * 2.992**2 / (500e-6 * 6.5), rel=0.05)
-    binary = probe_of(case_of((64, 48), 5.5e-3, profile="binary")).numbers()
-    assert binary.epsilon == pytest.approx(9 * epsilon)
-    assert binary.first_order == pytest.approx(81 * epsilon * phase)
-
-
-@pytest.mark.thorough
-def test_one_compilation_for_cameras_of_one_structure(caplog):
-    """Other numbers and another shape of the sensor: nothing is compiled again."""
-
-    def measure(case):
-        probe = probe_of(case)
-        for model in CLOSED:
-            probe.difference(model, "separable")
-            probe.rounding(model, "float32")
-        return probe.paraxial_error()
-
-    def compilations(case):
-        caplog.clear()
-        with jax.log_compiles():
-            measure(case)
-        return [r.getMessage() for r in caplog.records if r.getMessage().startswith("Compiling")]
-
-    jax.clear_caches()
-    assert any("closed_terms" in line for line in compilations(case_of((48, 80), 5.5e-3)))
-    assert compilations(case_of((300, 77), 0.011, beta=60.0, distance=1.0)) == []
-
-
 def test_models_without_nodes_are_compiled_once(monkeypatch):
     """Whatever the fringes of a pixel: in `explore` each number of nodes made a program of each."""
     given = set()

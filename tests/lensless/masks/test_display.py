@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import finite_difference, quick, relative_l2, value_and_slope
+from helpers import finite_difference, quick, value_and_slope
 from thincam_jax.lensless.masks.display import on_display
 from thincam_jax.lensless.masks.phase import MaskBlank
 from thincam_jax.units import nm, um
@@ -68,15 +68,6 @@ def test_many_cells_are_a_sampled_mask_with_gaps():
     assert float(shadow.sum()) * 0.031**2 == pytest.approx(light, rel=1e-9)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("height", [None, 0.9])
-def test_zones_are_those_of_a_zone_plate_with_pixels(height):
-    numbers = {"width": 1.2, "height": height, "centre": CENTRE}
-    own = tc.FresnelZoneAperture(25.0, 0.3, pixel_pitch=PITCH, fill_factor=FILL, **numbers)
-    shown = on_display(tc.FresnelZoneAperture(25.0, 0.3, **numbers), PITCH, FILL)
-    np.testing.assert_allclose(psf(shown), psf(own), rtol=1e-11, atol=1e-12)
-
-
 def relief(fill):
     heights = np.random.default_rng(2).uniform(0, 1e-3, (20, 30))
     smooth = MaskBlank((20, 30), 0.06, 1.5).mask(heights, "bilinear")
@@ -122,21 +113,6 @@ def test_gradients_and_vmap():
     several = jnp.stack([numbers, numbers * 1.01])
     some = jax.jit(jax.vmap(total))(several)
     np.testing.assert_allclose(some, [value(each) for each in several], rtol=1e-9)
-
-
-@pytest.mark.thorough
-def test_models_and_plans():
-    camera = tc.LenslessCamera(
-        on_display(tc.ModifiedUniformlyRedundantArray(5, 0.06), PITCH, FILL), SENSOR, DISTANCE
-    )
-    choice = tc.choose_model(camera, wavelength=WAVELENGTH, tolerance=0.3, pixel_integration=False)
-    exact = tc.psf(camera, wavelength=WAVELENGTH, pixel_integration=False)
-    found = tc.psf(camera, wavelength=WAVELENGTH, model=choice.method, pixel_integration=False)
-    assert relative_l2(found, exact) <= choice.predicted_error <= 0.3
-    scene = tc.Scene(tc.ImagePlane(np.eye(9, 12), 150.0, 20.0), WAVELENGTH)
-    plan = tc.plan_capture(camera, scene, tolerance=1e-2, over_field=False)
-    seen, full = tc.capture(camera, scene, model=plan), tc.capture(camera, scene)
-    assert relative_l2(seen, full) <= plan.predicted_error <= 1e-2
 
 
 def test_refuses():

@@ -12,7 +12,6 @@ from lensless.masks.families import DISTANCE, PITCH, SHAPE, WAVELENGTH
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2, value_and_slope
-from thincam_jax.imaging.operators.base import adjoint_error
 
 INF = math.inf
 NAMES = tuple(families.masks())
@@ -87,14 +86,6 @@ def eqx_set(mask, **numbers):
     return copy
 
 
-@every_family("ura")
-def test_vmap_is_a_loop(name):
-    mask, distances = families.masks()[name], jnp.asarray([1.0, DISTANCE, 5.0])
-    one = functools.partial(evaluate, mask, SENSOR)
-    many = jax.vmap(lambda d: one(d, jnp.asarray(WAVELENGTH), jnp.asarray(INF)))(distances)
-    np.testing.assert_allclose(many[1], psf_of(mask), rtol=1e-12)
-
-
 @every_family("mura")
 def test_light_that_passes_arrives(name):
     """Σ h pitch²/M² is the throughput's light, but for what is diffracted beyond the sensor."""
@@ -134,16 +125,6 @@ def test_shadow(name):
     assert relative_l2(waves, psf_of(mask, 40.0, model="geometric")) < 5e-3
 
 
-@pytest.mark.thorough
-def test_one_cell_is_a_pinhole_is_a_zone_plate_without_zones():
-    opening = tc.Pinhole(families.CELL, centre=families.CENTRE)
-    expected = psf_of(opening, 40.0)
-    cell = tc.SeparableMask([1.0], [1.0], families.CELL, centre=families.CENTRE)
-    np.testing.assert_allclose(psf_of(cell, 40.0), expected, rtol=1e-12)
-    even = tc.FresnelZoneAperture(1e-12, width=families.CELL, centre=families.CENTRE)
-    np.testing.assert_allclose(psf_of(even, 40.0), expected, rtol=1e-9)
-
-
 @every_family("ura")
 def test_near_and_far(name):
     """The shadow at a nanometre; at a metre against quadrature, to 1e-9 of a PSF of 1e-6."""
@@ -168,49 +149,3 @@ def test_cells_smaller_than_a_pixel(name):
     average = h.reshape(4, fine, 5, fine).mean(axis=(1, 3))
     found = psf_of(mask, 40.0, sensor=tc.Sensor((4, 5), pitch), average=True)
     assert relative_l2(found, average) < 0.01
-
-
-def test_operator_has_its_adjoint():
-    from thincam_jax.imaging.operators import CropConvolution
-
-    h = jnp.asarray(psf_of(families.masks()["mura"], 40.0, average=True))
-    operator = CropConvolution(h, PITCH, (8, 9), (7, 11))
-    assert adjoint_error(operator, jax.random.key(0)) < 1e-12
-
-
-def test_pure_phase_has_no_shadow():
-    with pytest.raises(TypeError, match="shadow .* LensletArray does not have; use 'separable'"):
-        psf_of(families.masks()["lenslets"], model="geometric")
-
-
-def test_zone_models_refuse_cells():
-    for model in ("closed_form", "paraxial"):
-        with pytest.raises(TypeError, match="needs the continuous zones of a FresnelZoneAperture"):
-            psf_of(families.masks()["mura"], model=model)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["mura", "lenslets"])
-def test_models_are_selected(name):
-    """The prediction is kept, and the models offered are those that can hold the mask."""
-    camera = tc.LenslessCamera(families.masks()[name], SENSOR, DISTANCE)
-    light = {"wavelength": WAVELENGTH, "object_distance": 40.0}
-    choice = tc.choose_model(camera, **light, tolerance=1e-4, pixel_integration=False)
-    assert choice.meets_tolerance
-    found = tc.psf(camera, **light, model=choice.method, pixel_integration=False)
-    exact = psf_of(camera.mask, 40.0)
-    assert relative_l2(np.asarray(found), exact) <= choice.predicted_error
-    offered = {prediction.method.model for prediction in choice.considered}
-    assert not offered & {"closed_form", "paraxial"}
-    assert ("geometric" in offered) == (name != "lenslets")
-
-
-@pytest.mark.thorough
-def test_a_scene_is_planned():
-    camera = tc.LenslessCamera(families.masks()["mura"], SENSOR, DISTANCE)
-    image = np.random.default_rng(0).uniform(size=(8, 9))
-    scene = tc.Scene(
-        [tc.ImagePlane(image, 40.0, 4.0)], tc.Spectrum(jnp.asarray([WAVELENGTH]), jnp.ones(1))
-    )
-    plan = tc.plan_capture(camera, scene, tolerance=1e-3, over_field=False)
-    assert plan.method.model == "separable" and plan.predicted_error <= 1e-3

@@ -1,7 +1,6 @@
 """The Fresnel zone aperture: its profile, edges, display pixels and refusals."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from lensless.propagation.reference import centred
@@ -112,12 +111,6 @@ def test_display_pixels():
 def test_refusals(arguments, message):
     with pytest.raises(ValueError, match=message):
         tc.FresnelZoneAperture(**({"beta": 25.0, "width": 1.0} | arguments))
-
-
-def test_integers_become_numbers_and_arrays_keep_their_precision():
-    mask = tc.FresnelZoneAperture(25, width=jnp.float32(2.0))
-    assert mask.beta.dtype == jnp.float64 and mask.beta == 25.0
-    assert mask.width.dtype == jnp.float32
 
 
 def test_other_numbers_keep_the_display():

@@ -1,13 +1,14 @@
-"""Pinholes, rings, lenslets and masks from numbers and files."""
+"""Pinholes, rings, lenslets, reliefs, and masks from numbers and files."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.ndimage
 
 import thincam_jax as tc
 from helpers import finite_difference, value_and_slope
-from thincam_jax.lensless.masks import random_cells
+from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.units import nm, um
 
 
 def test_round_pinhole_on_the_axis():
@@ -20,19 +21,6 @@ def test_round_pinhole_on_the_axis():
         method = tc.PsfMethod("angular_spectrum", mask_shape=(301, 301))
         h = tc.psf(camera, wavelength=wavelength, model=method, pixel_integration=False)
         assert float(h[0, 0]) == pytest.approx(4 * np.sin(np.pi * zones / 2) ** 2, abs=0.06)
-
-
-@pytest.mark.thorough
-def test_rings_are_sampled_by_their_area():
-    rings = np.array([0.0, 1.0, 0.25])
-    mask = tc.RadialMask(rings, 0.1, centre=(0.013, -0.02))
-    value = np.asarray(mask.sample(tc.Grid((31, 34), 0.023)))
-    radii = 0.1 * np.arange(4)
-    expected = np.sum(rings * np.pi * np.diff(radii**2))
-    assert value.sum() * 0.023**2 == pytest.approx(expected, rel=1e-12)
-    y, x = ((np.arange(n) - (n - 1) / 2) * 0.023 for n in (31, 34))
-    inside = np.hypot(y[:, None] - 0.013, x + 0.02) < 0.1 - 0.023
-    assert np.abs(value[inside]).max() < 1e-12
 
 
 def test_gradients_of_rings():
@@ -52,22 +40,6 @@ def test_gradients_of_rings():
         np.testing.assert_allclose(found[i], expected, rtol=1e-5)
 
 
-@pytest.mark.thorough
-def test_light_behind_rings_arrives():
-    """All that passes them falls on a sensor that is wide enough; vmap is a loop."""
-    mask = tc.RadialMask([1.0, 0.0, 0.5], 0.05)
-    passed = np.pi * 0.05**2 * (1 + 0.25 * (9 - 4))
-
-    def one(distance):
-        camera = tc.LenslessCamera(mask, tc.Sensor((100, 104), 5e-3), distance)
-        method = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(64, 64))
-        return tc.psf(camera, wavelength=500e-6, model=method, pixel_integration=True)
-
-    several = jax.jit(jax.vmap(one))(jnp.asarray([1.0, 2.0]))
-    np.testing.assert_allclose(several[0], one(1.0), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(several.sum(axis=(1, 2)) * 5e-3**2 / passed, 1, rtol=0.02)
-
-
 def test_a_lens_focuses():
     """At the focal length a square lens gives (w²/(λf))² sinc² sinc²."""
     mask, wavelength, f, w = tc.LensletArray(4.0, 0.5), 500e-6, 4.0, 0.5
@@ -78,18 +50,6 @@ def test_a_lens_focuses():
     np.testing.assert_allclose(found, (w * w / (wavelength * f) * lobes) ** 2, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match="give wavelength in mm"):
         mask.sample(camera.sensor.grid)
-
-
-def test_random_cells():
-    mask = random_cells(jax.random.key(0), 1.2, 0.03, height=0.6, open_fraction=0.3)
-    same = random_cells(0, 1.2, 0.03, height=0.6, open_fraction=0.3)
-    assert (same.amplitude == mask.amplitude).all()
-    assert mask.amplitude.shape == (20, 40)
-    assert abs(float(mask.amplitude.mean()) - 0.3) < 0.06
-    # In single precision 12000 cells of 0.1 µm are some 1e-8 mm off.
-    assert random_cells(jax.random.key(0), np.float32(1.2), np.float32(1e-4), height=1e-3)
-    with pytest.raises(ValueError, match=r"width = 1 mm is not a whole .* give width = 2 mm$"):
-        random_cells(jax.random.key(0), 1.0, 2.0)
 
 
 def test_masks_from_pictures(tmp_path):
@@ -116,3 +76,65 @@ def test_masks_from_pictures(tmp_path):
     with pytest.raises(ValueError, match=r"mask 1920 mm wide; .*: 0.012 for a mask 4.8 mm wide"):
         tc.read_mask(wide, 4.8)
     assert tc.read_mask(wide, 0.012).amplitude.shape == (400, 400)
+
+
+WAVELENGTH = 500 * nm
+BLANK = MaskBlank((300, 420), 2 * um, 1.5)
+
+
+def test_a_diffuser_has_the_slope_and_the_correlation_it_is_asked_for(key):
+    """rms slope s along both axes, autocovariance σ² exp(−r²/ℓ²) with s = √2 σ/ℓ."""
+    length, slope = 16 * um, 0.05
+    mask = diffuser(key, BLANK, correlation_length=length, rms_slope=slope)
+    height = np.asarray(mask.height)
+    assert height.min() == 0
+    for axis in (0, 1):
+        steps = np.diff(height, axis=axis) / (2 * um)
+        # A difference over one cell is the slope's mean over it: (p/ℓ)²/4 too small.
+        assert abs(np.sqrt(np.mean(steps**2)) / slope - 1) < 0.03
+    sigma = slope * length / np.sqrt(2)
+    flat = height - height.mean()
+    assert abs(flat.std() / sigma - 1) < 0.05
+    for lag in (4, 8, 12):
+        expected = np.exp(-((lag * 2 * um / length) ** 2))
+        for one, other in ((flat[lag:], flat[:-lag]), (flat[:, lag:], flat[:, :-lag])):
+            assert abs(np.mean(one * other) / sigma**2 - expected) < 0.07
+    # Gaussian: no skewness, no excess; opposite rims are unlike.
+    scaled = flat / flat.std()
+    assert abs(np.mean(scaled**3)) < 0.15 and abs(np.mean(scaled**4) - 3) < 0.3
+    assert abs(np.mean(scaled[0] * scaled[-1])) < 0.5
+
+
+def test_every_site_of_a_voronoi_fresnel_mask_is_a_focus(key):
+    """Twelve lenses: twelve equal points on the sensor at their focal length, far above the rest.
+
+    Lloyd's relaxation spreads them: the nearest two are much farther apart than random ones.
+    """
+    blank = MaskBlank((200, 260), 2 * um, 1.5)
+    mask = voronoi_fresnel(key, blank, sites=12, focal_length=2.0, wavelength=WAVELENGTH)
+    assert 0 <= float(mask.height.min()) and float(mask.height.max()) < 1 * um
+    camera = tc.LenslessCamera(mask, tc.Sensor((200, 260), 2 * um), 2.0)
+    method = tc.PsfMethod("angular_spectrum", oversampling=1)
+    h = np.asarray(tc.psf(camera, wavelength=WAVELENGTH, model=method, pixel_integration=False))
+    peak = (h == scipy.ndimage.maximum_filter(h, 15)) & (h > 0.3 * h.max())
+    assert peak.sum() == 12
+    places = np.argwhere(peak) * 2 * um
+    near = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
+    even = np.sqrt(0.4 * 0.52 / 12)
+    assert near.min() > 0.7 * even
+
+
+def test_refuses(key):
+    with pytest.raises(ValueError, match="correlation_length = 0.003 mm is 1.5 cells of the blank"):
+        diffuser(key, BLANK, correlation_length=3 * um, rms_slope=0.1)
+    lenses = {"focal_length": 2.0, "wavelength": WAVELENGTH}
+    with pytest.raises(ValueError, match="sites = 0; give 1 to the number of cells"):
+        voronoi_fresnel(key, BLANK, sites=0, **lenses)
+    with pytest.raises(ValueError, match=r"a lens reaches .* give more sites, a longer focal_len"):
+        voronoi_fresnel(key, BLANK, sites=1, **lenses)
+    with pytest.raises(ValueError, match=r"height reaches from 0 to .*; give 0 to 0.1 mm"):
+        diffuser(key, BLANK, correlation_length=16 * um, rms_slope=10.0)
+    with pytest.raises(
+        ValueError, match=r"height has shape \(3, 4\) and the blank \(.*give as many"
+    ):
+        BLANK.mask(np.zeros((3, 4)))

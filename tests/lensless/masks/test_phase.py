@@ -8,7 +8,7 @@ from lensless.propagation import reference
 from scipy.special import j1, jv
 
 import thincam_jax as tc
-from helpers import finite_difference, relative_l2, value_and_slope
+from helpers import finite_difference, point_psf, relative_l2, value_and_slope
 from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.units import nm, um
 
@@ -30,12 +30,11 @@ def camera(mask, shape=(48, 64), pitch=5 * um, distance=10.0):
 
 def psf(camera, model=AS, *, pixel_integration=False, object_distance=np.inf, **settings):
     return np.asarray(
-        tc.psf(
+        point_psf(
             camera,
             wavelength=settings.pop("wavelength", WAVELENGTH),
             object_distance=object_distance,
             model=tc.PsfMethod(model, pixel_integration=pixel_integration, **settings),
-            pixel_integration=False,
         )
     )
 
@@ -161,18 +160,6 @@ def test_both_sampled_models_agree_and_dispersion_is_the_materials():
     np.testing.assert_allclose(red, np.exp(2j * np.pi * (n - 1) * height / 632.8e-6), atol=2e-4)
 
 
-@pytest.mark.thorough
-def test_light_is_kept():
-    """All that passes the mask falls on a sensor that is wide enough, and a grey one takes its."""
-    rng = np.random.default_rng(5)
-    height, grey = rng.uniform(0, TURN, (18, 22)), rng.uniform(0, 1, (18, 22))
-    for passed in (None, grey):
-        mask = tc.PhaseMask(height, 10 * um, INDEX, amplitude=passed)
-        h = psf(camera(mask, (80, 84), 5 * um, 1.0), oversampling=3, pixel_integration=True)
-        area = (10 * um) ** 2 * (height.size if passed is None else np.sum(grey**2))
-        assert abs(h.sum() * (5 * um) ** 2 / area - 1) < 0.02
-
-
 @pytest.mark.parametrize(
     ("distance", "pitch", "model", "oversampling"),
     [
@@ -187,12 +174,7 @@ def test_one_cell_is_a_pinhole(distance, pitch, model, oversampling):
     here = camera(mask, (12, 14), pitch, distance)
     exact = tc.LenslessCamera(tc.Pinhole(40 * um), here.sensor, distance)
     found = psf(here, model=model, oversampling=oversampling, mask_shape=(64, 64))
-    assert (
-        relative_l2(
-            found, np.asarray(tc.psf(exact, wavelength=WAVELENGTH, pixel_integration=False))
-        )
-        < 0.03
-    )
+    assert relative_l2(found, np.asarray(point_psf(exact, wavelength=WAVELENGTH))) < 0.03
 
 
 @pytest.mark.parametrize(
@@ -211,7 +193,7 @@ def test_gradients(interpolation):
         where = tc.LenslessCamera(mask, tc.Sensor((10, 12), 5 * um), distance)
         light = {"wavelength": wavelength, "object_distance": away}
         method = tc.PsfMethod(AS, oversampling=3, mask_shape=(20, 22))
-        return jnp.sum(weights * tc.psf(where, model=method, **light, pixel_integration=False))
+        return jnp.sum(weights * point_psf(where, model=method, **light))
 
     given = (1.49, 10.1 * um, 1.3 * um, 0.7 * um, WAVELENGTH, 1.5, 40.0)
     numbers = (height, *(jnp.asarray(n) for n in given))
@@ -224,21 +206,6 @@ def test_gradients(interpolation):
         direction = (*zero[:index], along, *zero[index + 1 :])
         expected = finite_difference(loss, numbers, direction, 2e-4 if index in (0, 1) else 1e-5)
         np.testing.assert_allclose(jnp.sum(found * along), expected, rtol=1e-5, atol=1e-8)
-
-
-@pytest.mark.thorough
-def test_vmap_over_wavelengths_is_one_psf_each():
-    mask = tc.PhaseMask(np.full((8, 9), 0.3 * TURN), 10 * um, bk7(), interpolation="bilinear")
-    here = camera(mask, (10, 12), 5 * um, 1.0)
-
-    def one(wavelength):
-        method = tc.PsfMethod(AS, oversampling=3, mask_shape=(16, 18))
-        return tc.psf(here, wavelength=wavelength, model=method, pixel_integration=False)
-
-    lights = jnp.array([450.0, 620.0]) * nm
-    several = jax.jit(jax.vmap(one))(lights)
-    for light, h in zip(lights, several, strict=True):
-        np.testing.assert_allclose(h, one(light), rtol=0, atol=1e-10)
 
 
 MAP = np.zeros((4, 6))
@@ -270,13 +237,6 @@ def test_models_without_phases_are_refused_in_one_line(model):
     assert "\n" not in str(told.value)
 
 
-def test_cells_finer_than_the_samples_are_refused_and_held_by_default():
-    here = camera(tc.PhaseMask(MAP, 2 * um, INDEX), (8, 10), 5 * um, 1.0)
-    with pytest.raises(ValueError, match=r"cells of 2 um are finer than samples 5 um apart"):
-        psf(here, oversampling=1)
-    np.testing.assert_array_equal(psf(here), psf(here, oversampling=3))
-
-
 @pytest.mark.parametrize(("model", "enough"), [(AS, 3), ("rayleigh_sommerfeld", 7)])
 def test_steep_slopes_are_refused_with_the_oversampling_that_holds_them(model, enough):
     """0.7 turns a cell of 5 µm: 140 cycles/mm, 1.4 π a sample; the sum's waves add to it."""
@@ -291,14 +251,6 @@ def test_steep_slopes_are_refused_with_the_oversampling_that_holds_them(model, e
             psf(here)
         held, finer = psf(here, oversampling=3), psf(here, oversampling=9)
         assert abs(np.argmax(held.sum(axis=0)) - np.argmax(finer.sum(axis=0))) <= 1
-
-
-def test_a_near_source_adds_its_slope():
-    """r/(λt) at the rim: 1 mm at 5 mm is 392 cycles/mm in green light."""
-    mask = tc.PhaseMask(np.zeros((10, 400)), 5 * um, INDEX)
-    here = camera(mask, (8, 10), 5 * um, 5.0)
-    with pytest.raises(ValueError, match=r"3.9 π .* \(392 cycles/mm\).* oversampling = 5 or more"):
-        psf(here, object_distance=5.0)
 
 
 def test_light_outside_of_the_materials_band_is_refused():

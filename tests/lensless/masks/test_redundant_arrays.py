@@ -52,29 +52,6 @@ def test_maximum_length_sequence(length):
     np.testing.assert_allclose(correlation(s[None], s[None])[0], expected, atol=1e-9)
 
 
-def test_noise_of_the_decoded_image():
-    """Correlation with G, by 4000 draws: read noise Nσ²/M², shot noise I_T/M.
-
-    N cells, M = (N − 1)/2 of them open; the image in units of the object: Σ G n/M. Each count is
-    Poisson of the light that the open cells pass, and |G| = 1 adds up the variance of all.
-    """
-    p, draws, sigma, random = 7, 4000, 3.0, np.random.default_rng(0)
-    mask = tc.ModifiedUniformlyRedundantArray(p, CELL)
-    a, g, open_cells = np.asarray(mask.cells), np.asarray(mask.decoder), (p * p - 1) / 2
-    scene = random.uniform(0, 200.0, (p, p))
-    counts = np.fft.ifft2(np.fft.fft2(a) * np.fft.fft2(scene)).real
-    np.testing.assert_allclose(correlation(g, counts) / open_cells, scene, atol=1e-9)
-    decode = np.fft.fft2(g).conj() / open_cells
-
-    def variance(noise):
-        return np.fft.ifft2(decode * np.fft.fft2(noise)).real.var(axis=0).mean()
-
-    read = variance(random.normal(0, sigma, (draws, p, p)))
-    assert read == pytest.approx(p * p * sigma**2 / open_cells**2, rel=0.02)
-    shot = variance(random.poisson(counts, (draws, p, p)))
-    assert shot == pytest.approx(scene.sum() / open_cells, rel=0.02)
-
-
 @pytest.mark.parametrize("length", [31, 255])
 def test_xor_of_codes_inverts_with_little_noise(length):
     """Mean of 1/|Â|² → 12/N², two thirds of it on the frequency axes."""

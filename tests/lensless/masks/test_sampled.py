@@ -12,13 +12,6 @@ sample = jax.jit(lambda mask, grid: mask.sample(grid))
 VALUES = np.array([[1.0, 0.2, 0.5], [0.0, 0.7, 1.0j]])
 
 
-def test_its_own_grid_gives_it_back():
-    mask = tc.SampledMask(VALUES, 0.1)
-    np.testing.assert_allclose(sample(mask, tc.Grid((2, 3), 0.1)), VALUES, atol=1e-14)
-    wide = sample(mask, tc.Grid((4, 5), 0.1))
-    np.testing.assert_allclose(wide, np.pad(VALUES, 1), atol=1e-14)
-
-
 def test_centre_moves_it_down_and_right():
     mask = tc.SampledMask(VALUES, 0.1, centre=(0.1, -0.1))
     moved = np.asarray(sample(mask, tc.Grid((4, 5), 0.1)))
@@ -35,17 +28,6 @@ def test_samples_average_their_area():
     np.testing.assert_allclose(between, mean, atol=1e-14)
     fine = np.asarray(sample(mask, tc.Grid((22, 31), 0.013)))
     np.testing.assert_allclose(fine.sum() * 0.013**2, VALUES.sum() * 0.01, rtol=1e-12)
-
-
-def test_extent_is_height_and_width():
-    height, width = tc.SampledMask(VALUES, 0.1).extent
-    np.testing.assert_allclose([height, width], [0.2, 0.3])
-
-
-def test_whole_numbers_become_real():
-    assert tc.SampledMask(np.eye(3, dtype=int), 0.1).amplitude.dtype == jnp.float64
-    with pytest.raises(ValueError, match="pitch = 0.0 mm is not positive"):
-        tc.SampledMask(VALUES, 0.0)
 
 
 @pytest.mark.parametrize("values", [VALUES, VALUES.T], ids=["wide", "tall"])

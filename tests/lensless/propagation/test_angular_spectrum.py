@@ -98,19 +98,6 @@ def test_steep_edge_waves_are_beyond_fresnel():
     assert relative_l2(fourier, direct) < 1e-3
 
 
-@pytest.mark.thorough
-def test_sampled_mask_is_the_aperture_sampled():
-    """The same samples as a `SampledMask`, whose cells are the mask plane's: the same PSF."""
-    plane = tc.Grid((54, 56), 0.01)
-    numbers = tc.SampledMask(sample(MASK, plane), 0.01)
-    same = sampled(numbers, GRID, GENTLE, mask_shape=(54, 56))
-    np.testing.assert_allclose(same, sampled(MASK, GRID, GENTLE, mask_shape=(54, 56)), atol=1e-12)
-    # Cells of the aperture's own pitch, moved by three rows and minus two columns.
-    moved = tc.SampledMask(sample(MASK, plane), 0.01, centre=(0.03, -0.02))
-    value = sampled(moved, GRID, GENTLE, mask_shape=(60, 60))
-    np.testing.assert_allclose(value[3:, :-2], same[:-3, 2:], rtol=0, atol=5e-3)
-
-
 @pytest.mark.parametrize(("padding", "tolerance"), [(1.0, 0.04), (2.0, 0.02)])
 def test_nothing_wraps_round(padding, tolerance):
     """A bright hole at one corner of the plane; the far corner gets its diffraction alone.
@@ -131,15 +118,6 @@ def test_nothing_wraps_round(padding, tolerance):
     assert value[far].max() < 3 * expected[far].max()
     wrapped = carry(sample(hole, GRID).astype(complex), GRID.pitch, path)
     assert (np.abs(wrapped[far]) ** 2).max() > 10 * expected[far].max()
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("shape", [(1, 1), (33, 2)])
-def test_thin_sensors(shape):
-    """Even against odd sizes, and sensors smaller than the mask: samples still coincide."""
-    grid = tc.Grid(shape, 0.01)
-    value = sampled(MASK, grid, GENTLE, mask_shape=(55, 57), oversampling=9)
-    np.testing.assert_allclose(value, exact(MASK, grid, GENTLE), rtol=0, atol=0.02)
 
 
 def test_a_plane_wave_turns_by_its_angle():

@@ -4,10 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lensless.propagation import reference
 from lensless.propagation.reference import chirp, chirp_by_quadrature
 
+import thincam_jax as tc
 from helpers import finite_difference
 from thincam_jax.lensless.propagation.chirp import chirp_integral
+from thincam_jax.lensless.propagation.closed_form import ChirpSum
 
 compiled = jax.jit(chirp_integral)
 B = float(np.pi / (500e-6 * 6.5))  # Fresnel curvature of the thesis' camera, 967 rad/mm²
@@ -136,28 +139,70 @@ def test_gradient_in_every_argument():
         assert error.max() < 2e-9, (i, cases[int(error.argmax())])
 
 
-@pytest.mark.thorough
-def test_jit_and_vmap_are_eager():
-    cases = jnp.asarray(list(points()))[::5]
-    together = chirp_integral(*cases.T)
-    np.testing.assert_allclose(together, compiled(*cases.T), rtol=0, atol=1e-15)
-    one_by_one = jax.jit(jax.vmap(chirp_integral))(*cases.T)
-    np.testing.assert_allclose(one_by_one, together, rtol=0, atol=1e-15)
+WEIGHTS = np.array([0.4, 0.3 - 0.2j, -0.1 + 0.5j])
+CURVATURES = np.array([0.0, 30.0, -55.0])
+CENTRE = (0.11, -0.07)
+SUM = ChirpSum(jnp.asarray(WEIGHTS + 0j), jnp.asarray(CURVATURES), jnp.asarray(CENTRE))
+
+sample = jax.jit(
+    lambda terms, grid, average: terms.sample(grid, pixel_integration=average).image(),
+    static_argnums=2,
+)
+transform = jax.jit(lambda terms, grid: terms.transform(grid))
 
 
-def test_broadcasts():
-    """(order, 1, 1) × (x, 1) × cell, as the models call it; each entry is its own integral."""
-    g = jnp.array([20.0, -30.0])[:, None, None]
-    x = jnp.array([-0.2, 0.1, 0.5])[:, None]
-    ends = jnp.array([-0.3, 0.05, 0.2, 0.4])
-    value = compiled(g, jnp.asarray(80.0), x, ends, ends + 0.1)
-    assert value.shape == (2, 3, 4)
-    expected = chirp(-30.0, 80.0, 0.5, 0.2, 0.3)
-    np.testing.assert_allclose(value[1, 2, 2], expected, rtol=0, atol=1e-14)
+def image(y, x):
+    r2 = (y[:, None] - CENTRE[0]) ** 2 + (x - CENTRE[1]) ** 2
+    return sum((w * np.exp(1j * g * r2)).real for w, g in zip(WEIGHTS, CURVATURES, strict=True))
 
 
-def test_no_branch():
-    """Under `vmap` a `lax.cond` becomes a select that computes both sides at every place."""
-    traced = str(jax.make_jaxpr(jax.vmap(chirp_integral))(*jnp.asarray(list(points())).T))
-    assert "cond[" not in traced
-    assert "select_n" in traced
+@pytest.mark.parametrize("shape", [(12, 17), (1, 1), (1, 9)])
+def test_values(shape):
+    grid = tc.Grid(shape, 0.05)
+    value = sample(SUM, grid, False)
+    expected = image(*(reference.centred(n, 0.05) for n in shape))
+    np.testing.assert_allclose(value, expected, rtol=0, atol=1e-13)
+
+
+def test_pixel_averages():
+    """Against 30×30 Gauss-Legendre points a pixel; the average differs from the value by 5 %."""
+    shape, pitch = (12, 17), 0.1
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    y, x = ((reference.centred(n, pitch)[:, None] + nodes * pitch / 2).ravel() for n in shape)
+    fine = image(y, x).reshape(12, 30, 17, 30)
+    expected = np.einsum("iajb,a,b->ij", fine, weights / 2, weights / 2)
+    value = sample(SUM, tc.Grid(shape, pitch), True)
+    np.testing.assert_allclose(value, expected, rtol=0, atol=1e-13)
+    assert np.abs(sample(SUM, tc.Grid(shape, pitch), False) - expected).max() > 0.05
+
+
+@pytest.mark.parametrize("shape", [(6, 9), (7, 4), (1, 5)])
+def test_transform(shape):
+    """The limit α → 0 of F{e^{(jγ−α)r²}} = π/(α−jγ)·e^{−π²ρ²/(α−jγ)}; Re{w·} adds the conjugate."""
+    grid = tc.Grid(shape, 0.05)
+    v, u = (np.fft.fftshift(np.fft.fftfreq(n, 0.05)) for n in shape)
+    rho2 = v[:, None] ** 2 + u**2
+    expected = np.zeros(shape, complex)
+    for w, g in zip(WEIGHTS[1:], CURVATURES[1:], strict=True):
+        for weight, s in ((w / 2, -1j * g), (np.conj(w) / 2, 1j * g)):
+            expected += weight * np.pi / s * np.exp(-(np.pi**2) * rho2 / s)
+    expected *= np.exp(-2j * np.pi * (v[:, None] * CENTRE[0] + u * CENTRE[1]))
+    expected[shape[0] // 2, shape[1] // 2] += WEIGHTS[0].real * shape[0] * shape[1] * 0.05**2
+    np.testing.assert_allclose(transform(SUM, grid), expected, rtol=0, atol=1e-12)
+
+
+def test_transform_by_summation():
+    """A direct sum over the plane, faded out by e^{−αr²}; what the fading costs falls with α."""
+    chirp = ChirpSum(jnp.asarray([0.3 - 0.2j]), jnp.asarray([30.0]), jnp.asarray(CENTRE))
+    grid = tc.Grid((5, 8), 0.1)
+    value = np.asarray(transform(chirp, grid))
+    v, u = (np.fft.fftshift(np.fft.fftfreq(n, 0.1)) for n in grid.shape)
+    x = reference.centred(1200, 0.01)
+    r2 = (x[:, None] - CENTRE[0]) ** 2 + (x - CENTRE[1]) ** 2
+    errors = []
+    for alpha in (0.6, 0.3):
+        faded = ((0.3 - 0.2j) * np.exp((30j - alpha) * r2)).real
+        kernels = [np.exp(-2j * np.pi * np.outer(f, x)) for f in (v, u)]
+        expected = kernels[0] @ faded @ kernels[1].T * 0.01**2
+        errors.append(np.abs(value - expected).max() / np.abs(value).max())
+    assert errors[1] < 0.3 and 1.6 < errors[0] / errors[1] < 2.4

@@ -123,15 +123,6 @@ def test_display_pixels():
     assert np.abs(between).max() == 0.0
 
 
-def test_sampled_mask():
-    amplitude = np.arange(6.0).reshape(2, 3) * (0.1 + 0.05j)
-    camera = tc.LenslessCamera(tc.SampledMask(amplitude, 0.2), tc.Sensor((2, 3), 0.25), 5.0)
-    value = tc.psf(
-        camera, wavelength=500e-6, object_distance=20.0, model="geometric", pixel_integration=False
-    )
-    np.testing.assert_allclose(value, np.abs(amplitude) ** 2, rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_gradient_in_width(average):
     """Zero where the PSF is point-sampled (a step); of the pixel average, exact.

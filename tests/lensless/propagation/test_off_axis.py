@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import count_traces
+from helpers import count_traces, point_psf
 from thincam_jax._core.precision import cast
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.masks import random_cells
@@ -146,18 +146,6 @@ def test_averages_of_the_full_size(angle, most):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("angle", "most"), [(0, 0.03), (20, 0.09), (30, 0.07)])
-def test_values_at_the_centres_of_pixels_against_the_direct_sum(angle, most):
-    """β = 25 rad/mm², d = 6.5 mm: 2, 8 and 5 % of a mask of few zones."""
-    mask = tc.FresnelZoneAperture(25.0, 0.3, width=1.0, height=0.8)
-    camera = tc.LenslessCamera(mask, tc.Sensor((8, 9), 120 * um), 6.5)
-    found = about_ray(camera, angle, 45, "separable")
-    shape = {"mask_shape": (7, 9)}
-    exact = about_ray(camera, angle, 45, "rayleigh_sommerfeld", 101, **shape)
-    assert relative(found, exact) < most
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("angle", "most", "axis"), [(20, 0.006, 1), (-20, 0.006, 0), (30, 0.008, 0)]
 )
@@ -200,22 +188,6 @@ def test_edges_without_a_closed_form_are_sampled(mask, most):
     assert relative(found, exact) < 0.012
     on_axis = tc.PsfMethod("angular_spectrum", pixel_integration=True, oversampling=7)
     assert relative(tc.psf(camera, wavelength=500 * nm, model=on_axis), exact) > 0.1
-
-
-@pytest.mark.thorough
-def test_under_jit_known_cells_are_sampled_as_outside():
-    camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
-    light = {"wavelength": 500 * nm, "object_distance": 30.0, "at": (0.4, 0.3)}
-    scaled = jax.jit(lambda scale: scale * tc.psf(camera, **light, pixel_integration=False))(2.0)
-    np.testing.assert_allclose(
-        scaled, 2 * tc.psf(camera, **light, pixel_integration=False), rtol=1e-9, atol=1e-12
-    )
-    steep = jax.jit(
-        lambda scale: (
-            scale * tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1), pixel_integration=False)
-        )
-    )
-    assert np.all(np.isfinite(steep(2.0)))
 
 
 def test_the_detour_turns_waves_as_the_distance_does():
@@ -273,11 +245,7 @@ def test_averages_are_means_over_points_of_a_pixel(pitch, most):
     light = {"wavelength": 500 * nm, "at": tangent}
     found = tc.psf(tc.LenslessCamera(mask, sensor, DISTANCE), pixel_integration=True, **light)
     fine = tc.LenslessCamera(mask, tc.Sensor((480, 640), pitch / 80), DISTANCE)
-    exact = (
-        np.asarray(tc.psf(fine, **light, pixel_integration=False))
-        .reshape(6, 80, 8, 80)
-        .mean((1, 3))
-    )
+    exact = np.asarray(point_psf(fine, **light)).reshape(6, 80, 8, 80).mean((1, 3))
     assert relative(np.asarray(found), exact) < most
 
 
@@ -291,7 +259,7 @@ def test_averages_follow_the_fringes_of_a_pixel(pitch, shape):
     points = round(9 * pitch * 0.5 / 1.15) // 2 * 2 + 1
     rows, columns = shape
     fine = camera.on_grid(tc.Grid((rows * points, columns * points), pitch * um / points))
-    exact = np.asarray(tc.psf(fine, at=(1.5, 2.0), **light, pixel_integration=False))
+    exact = np.asarray(point_psf(fine, at=(1.5, 2.0), **light))
     exact = exact.reshape(rows, points, columns, points).mean((1, 3))
     averaged = light | {"pixel_integration": True}
     found = np.asarray(tc.psf(camera, at=(1.5, 2.0), **averaged))
@@ -333,13 +301,7 @@ def camera_of(beta=25.0, distance=6.5, width=2.0, pitch=200 * um):
 
 def psf(at, beta=25.0, distance=6.5, wavelength=500 * nm, object_distance=100.0):
     camera = camera_of(beta, distance)
-    return tc.psf(
-        camera,
-        wavelength=wavelength,
-        object_distance=object_distance,
-        at=at,
-        pixel_integration=False,
-    )
+    return point_psf(camera, wavelength=wavelength, object_distance=object_distance, at=at)
 
 
 anywhere = jax.jit(lambda at, distance: psf(at, object_distance=distance))
@@ -348,9 +310,7 @@ anywhere = jax.jit(lambda at, distance: psf(at, object_distance=distance))
 @pytest.mark.thorough
 @pytest.mark.parametrize("distance", [INF, 100.0])
 def test_on_the_axis_it_is_the_psf_of_the_axis(distance):
-    expected = tc.psf(
-        camera_of(), wavelength=500 * nm, object_distance=distance, pixel_integration=False
-    )
+    expected = point_psf(camera_of(), wavelength=500 * nm, object_distance=distance)
     for at in ((0.0, 0.0), (0.0, 1e-9), (1e-9, 1e-9)):
         assert relative(anywhere(jnp.asarray(at), distance), expected) < 1e-6
     assert relative(psf((0.0, 0.0), object_distance=distance), expected) < 1e-12
@@ -364,11 +324,9 @@ def test_cells_are_continuous_at_the_axis_and_have_slopes():
 
     @jax.jit
     def value(x):
-        return jnp.sum(
-            weights * tc.psf(camera, wavelength=500 * nm, at=(0.0, x), pixel_integration=False)
-        )
+        return jnp.sum(weights * point_psf(camera, wavelength=500 * nm, at=(0.0, x)))
 
-    on_axis = float(jnp.sum(weights * tc.psf(camera, wavelength=500 * nm, pixel_integration=False)))
+    on_axis = float(jnp.sum(weights * point_psf(camera, wavelength=500 * nm)))
     assert float(value(1e-9)) == pytest.approx(on_axis, rel=1e-6)
     difference = (value(0.2 + 1e-6) - value(0.2 - 1e-6)) / 2e-6
     assert float(jax.grad(value)(0.2)) == pytest.approx(float(difference), rel=1e-5)
@@ -386,14 +344,7 @@ def test_the_shadow_moves_against_the_point():
     camera = tc.LenslessCamera(tc.Pinhole(0.5), tc.Sensor((60, 80), 40 * um), 6.5)
     at = np.array([10.0, -14.0])
     h = np.asarray(
-        tc.psf(
-            camera,
-            wavelength=500 * nm,
-            object_distance=100.0,
-            at=at,
-            model="geometric",
-            pixel_integration=False,
-        )
+        point_psf(camera, wavelength=500 * nm, object_distance=100.0, at=at, model="geometric")
     )
     y, x = np.asarray(camera.sensor.grid.y), np.asarray(camera.sensor.grid.x)
     middle = np.array([h.sum(1) @ y, h.sum(0) @ x]) / h.sum()
@@ -437,30 +388,15 @@ def test_batches_and_new_values_are_one_program():
 def test_single_precision(at):
     camera = camera_of(width=5.632, pitch=400 * um)
     exact, single = (
-        tc.psf(
+        point_psf(
             camera,
             wavelength=500 * nm,
             object_distance=100.0,
             at=at,
             model=tc.PsfMethod("separable", precision),
-            pixel_integration=False,
         )
         for precision in ("float64", "float32")
     )
-    assert relative(np.asarray(single, float), exact) < 1e-4
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("averaged", [False, True])
-@pytest.mark.parametrize("at", [(5.0, 7.0), (0.0, 7.0)])
-def test_a_point_in_double_precision_leaves_a_single_camera_single(averaged, at):
-    camera, at = camera_of(), np.array(at)
-    light = {"wavelength": np.float64(500 * nm), "object_distance": 100.0}
-    light |= {"pixel_integration": averaged}
-    exact = tc.psf(camera, at=at, **light)
-    with jax.numpy_dtype_promotion("standard"):  # as a user has it
-        single = tc.psf(cast(camera, "float32"), at=jnp.asarray(at), **light)
-    assert single.dtype == jnp.float32
     assert relative(np.asarray(single, float), exact) < 1e-4
 
 
@@ -469,13 +405,7 @@ def test_light_of_the_open_aperture_is_1():
     """Far inside the shadow, at 20°, by each model."""
     camera = tc.LenslessCamera(tc.Pinhole(3.0), tc.Sensor((5, 6), 20 * um), 2.0)
     for model in ("geometric", "separable", tc.PsfMethod("angular_spectrum", oversampling=5)):
-        h = tc.psf(
-            camera,
-            wavelength=500 * nm,
-            at=(0.0, np.tan(20 * deg)),
-            model=model,
-            pixel_integration=False,
-        )
+        h = point_psf(camera, wavelength=500 * nm, at=(0.0, np.tan(20 * deg)), model=model)
         np.testing.assert_allclose(np.mean(h), 1.0, atol=0.03)
 
 
@@ -487,64 +417,30 @@ def test_models_of_the_axis_say_so(model):
     with pytest.raises(
         ValueError, match=f"{model!r} is for points on the axis: leave `at` out, or"
     ):
-        tc.psf(
-            camera_of(), wavelength=500 * nm, at=(0.0, 0.1), model=model, pixel_integration=False
-        )
+        point_psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1), model=model)
 
 
 def test_lenses_off_both_axes_name_the_sampled_model():
     camera = tc.LenslessCamera(tc.LensletArray(5.0, 0.4, (2, 3)), SENSOR, DISTANCE)
     with pytest.raises(TypeError, match=r"on one of its axes only; give at = \(y, 0\) or \(0, x\)"):
-        tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1), pixel_integration=False)
-    h = tc.psf(
-        camera,
-        wavelength=500 * nm,
-        at=(0.1, 0.1),
-        model="angular_spectrum",
-        pixel_integration=False,
-    )
+        point_psf(camera, wavelength=500 * nm, at=(0.1, 0.1))
+    h = point_psf(camera, wavelength=500 * nm, at=(0.1, 0.1), model="angular_spectrum")
     assert np.all(np.isfinite(h))
-
-
-@pytest.mark.thorough
-def test_slow_samples_are_told_beforehand(monkeypatch):
-    """With the samples that are named, without a word."""
-    monkeypatch.setattr("thincam_jax.lensless.resolve._SLOW", 1e8)
-    camera, light = tc.LenslessCamera(mura(), SENSOR, DISTANCE), {"wavelength": 500 * nm}
-    light |= {"at": (0.03, 0.04)}
-    with pytest.warns(AccuracyWarning, match=r"35×35 samples .* oversampling=13\) takes a tenth"):
-        fine = tc.psf(camera, pixel_integration=True, **light)
-    coarse = tc.PsfMethod("angular_spectrum", oversampling=13, pixel_integration=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert relative(tc.psf(camera, model=coarse, **light), fine) < 0.1
 
 
 def test_steep_light_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        tc.psf(
-            camera_of(width=5.632),
-            wavelength=500 * nm,
-            at=(0.0, np.tan(30 * deg)),
-            pixel_integration=False,
-        )
+        point_psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(30 * deg)))
     with pytest.warns(AccuracyWarning, match="at 60° waves of third order"):
-        tc.psf(
-            camera_of(width=5.632),
-            wavelength=500 * nm,
-            at=(0.0, np.tan(60 * deg)),
-            pixel_integration=False,
-        )
+        point_psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(60 * deg)))
 
 
 def test_zones_that_focus_off_both_axes_are_sampled():
     """Order −1 of β = 62.83 rad/mm² focuses on a sensor at 100 mm; inside jit it is refused."""
     at, given = (0.02, 0.02), {"beta": 62.83, "distance": 100.0, "object_distance": INF}
     sampled = tc.PsfMethod("angular_spectrum", oversampling=61)
-    exact = tc.psf(
-        camera_of(62.83, 100.0), wavelength=500 * nm, at=at, model=sampled, pixel_integration=False
-    )
+    exact = point_psf(camera_of(62.83, 100.0), wavelength=500 * nm, at=at, model=sampled)
     assert relative(psf(at, **given), exact) < 0.01
     with pytest.raises(Exception, match="an order focuses nearly on the sensor; use 'angular"):
         jax.jit(lambda y: psf((y, 0.02), **given))(0.02)

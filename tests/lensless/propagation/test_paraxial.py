@@ -6,7 +6,8 @@ import pytest
 from lensless.propagation import reference
 
 import thincam_jax as tc
-from thincam_jax.lensless.propagation.paraxial import paraxial_response
+from helpers import point_psf
+from thincam_jax.lensless.propagation.closed_form import paraxial_response
 
 BETA, PHASE = 25.0, 0.8
 
@@ -15,11 +16,7 @@ def psf_of(model, wavelength, *, shape=(50, 61), pitch=0.01, distance=6.5, t=np.
     camera = tc.LenslessCamera(
         tc.FresnelZoneAperture(BETA, PHASE, width=2.0, **mask), tc.Sensor(shape, pitch), distance
     )
-    return np.asarray(
-        tc.psf(
-            camera, wavelength=wavelength, object_distance=t, model=model, pixel_integration=False
-        )
-    )
+    return np.asarray(point_psf(camera, wavelength=wavelength, object_distance=t, model=model))
 
 
 @pytest.mark.parametrize("t", [np.inf, 70.0])
@@ -90,8 +87,5 @@ def test_phases_far_outside_its_validity_take_double_precision(profile):
     camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 0.3 / 32), 990.0)
     single, double = (tc.PsfMethod("paraxial", precision=p) for p in ("float32", "float64"))
     with pytest.raises(ValueError, match=r"PsfMethod\('paraxial', precision='float64'\)"):
-        tc.psf(camera, wavelength=500e-6, model=single, pixel_integration=False)
-    assert (
-        float(tc.psf(camera, wavelength=500e-6, model=double, pixel_integration=False).min())
-        > -1e-6
-    )
+        point_psf(camera, wavelength=500e-6, model=single)
+    assert float(point_psf(camera, wavelength=500e-6, model=double).min()) > -1e-6

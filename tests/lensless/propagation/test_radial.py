@@ -10,8 +10,8 @@ from scipy.special import j0
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2, value_and_slope
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.method import LATTICE_POINTS
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import (
     PROFILE_ERROR,
     irradiance,
@@ -147,18 +147,6 @@ def test_choice_meets_the_tolerance():
 
 
 @pytest.mark.thorough
-def test_choice_among_points_of_a_pixel():
-    camera = camera_of(shape=(96, 75), pitch=5.5 * um)
-    light: dict[str, Any] = {"wavelength": WAVELENGTH, "object_distance": 250.0}
-    method = tc.PsfMethod("radial", "float64", True, nodes=987)
-    exact = psf(camera, model=method)
-    for tolerance in (2e-2, 5e-3):
-        choice = tc.choose_model(camera, tolerance=tolerance, pixel_integration=True, **light)
-        off = relative_l2(psf(camera, model=choice.method), exact)
-        assert off <= choice.predicted_error <= tolerance
-
-
-@pytest.mark.thorough
 def test_gradients_in_every_number():
     """d, λ, t, values and widths of rings and their place, on and off the shadow's rims."""
     weights = jnp.asarray(np.random.default_rng(1).uniform(size=(9, 12)))
@@ -175,22 +163,6 @@ def test_gradients_in_every_number():
     for i in range(len(start)):
         expected = finite_difference(value, start, jnp.zeros(len(start)).at[i].set(1.0), 1e-6)
         np.testing.assert_allclose(found[i], expected, rtol=1e-5, atol=1e-5)
-
-
-def test_new_values_trace_once_and_vmap_is_a_loop():
-    traces = []
-
-    @jax.jit
-    def one(distance, ring):
-        traces.append(0)
-        return psf(camera_of([1.0, 0.0, 0.6], ring, (5, 8), 36 * um, distance))
-
-    several = jax.vmap(one, (0, None))(jnp.asarray([1.0, 2.0]), 0.03)
-    assert len(traces) == 1
-    for distance, image in zip((1.0, 2.0), several, strict=True):
-        np.testing.assert_allclose(image, one(distance, 0.03), rtol=0, atol=1e-12)
-    one(1.7, 0.04)
-    assert len(traces) == 2
 
 
 def test_other_masks_and_shapes_are_refused():

@@ -65,17 +65,6 @@ def test_against_quadrature():
     np.testing.assert_allclose(value[:, ::2], expected[:, ::2], rtol=2e-2)
 
 
-@pytest.mark.thorough
-def test_pixel_average_of_both_planes():
-    """A small aperture, so that few samples do; the average is 10 % off the centre."""
-    mask = tc.FresnelZoneAperture(2000.0, 0.3, width=0.11)
-    grid, path = tc.Grid((4, 5), 0.04), LightPath(WAVELENGTH, 5.0)
-    value = direct(mask, grid, path, mask_shape=(4, 5), oversampling=11, pixel_integration=True)
-    expected = exact(mask, grid, path, average=True)
-    assert relative_l2(value, expected) < 2e-2
-    assert relative_l2(exact(mask, grid, path), expected) > 0.1
-
-
 def test_refuses_a_mask_wider_than_its_plane():
     with pytest.raises(Exception, match="wider than the plane that samples it"):
         jnp.sum(

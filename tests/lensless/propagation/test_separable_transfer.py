@@ -110,22 +110,6 @@ def test_against_the_transform_of_the_psf():
     assert errors[0] > errors[1] > errors[2]
 
 
-def test_nothing_beyond_the_cut_off():
-    u = np.array([0.5, 1.0, 1.001, 40.0]) * CUT_OFF
-    value = response(mask_of(), LightPath(WAVELENGTH, DISTANCE), u, u)
-    assert value[0, 0] != 0
-    np.testing.assert_array_equal(value[2:], 0.0)
-    np.testing.assert_array_equal(value[:, 2:], 0.0)
-
-
-@pytest.mark.thorough
-def test_pixel_average():
-    path = LightPath(WAVELENGTH, DISTANCE, 60.0)
-    factor = np.outer(np.sinc(0.03 * V), np.sinc(0.03 * U))
-    value = response(mask_of(), path, pixel_pitch=0.03)
-    np.testing.assert_allclose(value, factor * response(mask_of(), path), rtol=1e-12, atol=1e-18)
-
-
 def test_single_precision():
     """Relative L2 at the thesis' size, up to 45 cycles/mm; measured 4e-6."""
     u = np.linspace(0, 45, 60)
@@ -204,21 +188,3 @@ def test_one_order_is_the_aperture():
     zones, path = mask_of().zone_orders(), LightPath(WAVELENGTH, DISTANCE)
     value = jax.jit(lambda u: overlaps(zones, path, u))(jnp.asarray([0.0]))
     np.testing.assert_allclose(value[0, 0], WIDTH, rtol=1e-14)
-
-
-def test_errors():
-    path = LightPath(WAVELENGTH, DISTANCE)
-    with pytest.raises(ValueError, match="has no display pixels; drop pixel_pitch"):
-        response(mask_of(pixel_pitch=0.05), path)
-    with pytest.raises(TypeError, match="needs the continuous zones"):
-        response(tc.SampledMask(np.ones((3, 4)), 0.1), path)
-
-
-@pytest.mark.thorough
-def test_rectangle_has_the_factors_of_two_squares():
-    path = LightPath(WAVELENGTH, DISTANCE)
-    given = [jnp.asarray(V), jnp.asarray(U)]
-    found = transfer_factors(mask_of(height=0.3), path, *given)
-    tall, wide = (transfer_factors(mask_of(width=side), path, *given) for side in (0.3, WIDTH))
-    np.testing.assert_allclose(found.rows, tall.rows, atol=1e-15)
-    np.testing.assert_allclose(found.columns, wide.columns, atol=1e-15)

@@ -137,16 +137,6 @@ def test_a_number_that_leaves_its_search_is_told():
 
 
 @pytest.mark.thorough
-def test_errors_grow_with_the_noise():
-    """Seven unknowns, 10 dB: the errors claimed still cover those made."""
-    fit = fit_psf(picture(TRUE, 3, snr_db=12.0), START, **LIGHT)
-    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
-    quiet = fit_psf(picture(TRUE, 3), START, **LIGHT)
-    ratio = float(fit.standard_errors["phase"] / quiet.standard_errors["phase"])
-    np.testing.assert_allclose(ratio, 10 ** (18 / 20), rtol=0.1)
-
-
-@pytest.mark.thorough
 def test_wavelength_and_distance_of_a_plane_wave_are_one():
     light = {"object_distance": math.inf, "wavelength": 500 * nm}
     fit = fit_psf(
@@ -192,19 +182,6 @@ def test_model_of_a_synthesis_is_the_sum_of_pictures():
 
 
 @pytest.mark.thorough
-def test_a_fringe_scanned_picture():
-    """It is complex; its background has cancelled."""
-    fit = fit_psf(synthesised(FRINGE_SCANNED), START, **LIGHT)
-    assert fit.status == "ok" and "background" not in fit.names
-    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
-    np.testing.assert_allclose(fit.camera.mask.beta, 30.0, rtol=1e-4)
-    assert fit.residual.dtype == np.complex128
-    # Noise of 30 dB of each of the four, two in each part.
-    residual = np.asarray(fit.residual)
-    assert np.std(residual.real) == pytest.approx(np.std(residual.imag), rel=0.05)
-
-
-@pytest.mark.thorough
 def test_phases_in_reverse_order_are_named_and_fitted():
     image = synthesised({-phase: weight for phase, weight in FRINGE_SCANNED.items()})
     fit = fit_psf(image, START, **LIGHT)
@@ -213,35 +190,6 @@ def test_phases_in_reverse_order_are_named_and_fitted():
     assert "the phases run backwards" in reason
     np.testing.assert_allclose(fit.camera.mask.beta, 30.0, rtol=1e-4)
     assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("weights", [{0.0: 1.0, 4.712389: -1.0}, {0.0: 1.0, 1.5707963: -1j}])
-def test_two_phases(weights):
-    """Their difference, which is real; and in quadrature, which keeps the background."""
-    fit = fit_psf(synthesised(weights), START, weights=weights, **LIGHT)
-    assert fit.status == "ok"
-    assert ("background" in fit.names) == (abs(sum(weights.values())) > 0)
-    off = deviations(fit, TRUE)
-    if "background" in fit.names:
-        off[fit.names.index("background")] -= 0.3 / float(fit.standard_errors["background"])
-    assert np.all(np.abs(off) < 4.5)
-
-
-@pytest.mark.thorough
-def test_another_picture_is_told():
-    noise = np.random.default_rng(0).normal(size=TRUE.sensor.shape)
-    fit = fit_psf(noise, START, **LIGHT)
-    assert fit.status in ("poor_fit", "not_converged")
-    assert any("contrast" in line for line in fit.reasons)
-
-
-@pytest.mark.thorough
-def test_new_values_do_not_compile_again():
-    fit_psf(picture(TRUE, 4), START, **LIGHT)
-    sizes = [f._cached._cache_size() for f in (problem._least_squares, problem.model)]
-    fit_psf(2.0 * picture(TRUE, 5), camera(29.0, 3.1), object_distance=103.0, wavelength=510 * nm)
-    assert sizes == [f._cached._cache_size() for f in (problem._least_squares, problem.model)]
 
 
 def test_residuals_follow_a_direct_sum():

@@ -96,14 +96,6 @@ def test_scale_and_shift(scale, shift):
 
 
 @pytest.mark.thorough
-def test_the_registered_reference_lies_on_the_capture():
-    capture = blobs(1.05, (2.0, -3.0))
-    found = estimate_registration(capture, blobs())
-    inner = (slice(30, -30), slice(30, -30))
-    np.testing.assert_allclose(found.registered[inner], capture[inner], atol=0.01)
-
-
-@pytest.mark.thorough
 def test_different_scenes_are_a_poor_fit():
     found = estimate_registration(blobs(seed=1), blobs(seed=2))
     assert found.status in ("poor_fit", "not_converged")

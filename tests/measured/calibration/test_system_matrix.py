@@ -118,11 +118,3 @@ def test_an_image_comes_back_by_the_measured_matrix(tmp_path):
     recording = tc.Recording(operator(image), recover_matrix(captures), noise_variance=1e-4)
     found = tc.reconstruct(recording, tc.Ridge(1e-6))
     np.testing.assert_allclose(np.squeeze(found.image), image, atol=0.03)
-
-
-def test_another_camera_than_the_sensor_is_refused(tmp_path):
-    writer = HadamardCaptures.create(tmp_path / "captures.zarr", HadamardSeries(CELLS), (10, 12))
-    with pytest.raises(
-        ValueError, match=r"goes from \(4, 8\) to \(12, 10\); give \(\(4, 8\), \(10"
-    ):
-        simulate_captures(writer, Matrix(TRUTH, CELLS, SHAPE), jax.random.key(5))

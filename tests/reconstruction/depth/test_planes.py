@@ -11,9 +11,9 @@ from reconstruction.depth import rig
 
 import thincam_jax as tc
 from thincam_jax.lensless.method import AccuracyWarning
-from thincam_jax.reconstruction import TotalVariation, fringe_scanning
+from thincam_jax.reconstruction import fringe_scanning
+from thincam_jax.reconstruction.assembly import without_smooth_misfit
 from thincam_jax.reconstruction.depth import find_distances, refocus_sweep
-from thincam_jax.reconstruction.planes import without_smooth_misfit
 from thincam_jax.reconstruction.problem import misfit
 
 PLANES = (20.0, 45.0, 150.0)
@@ -58,14 +58,6 @@ def test_each_object_is_in_its_own_plane(seen):
     np.testing.assert_allclose(
         result.pitch, np.array(PLANES) * rig.PITCH / rig.DISTANCE, rtol=1e-12
     )
-
-
-@pytest.mark.thorough
-def test_a_depth_weight_pulls_the_planes_together(seen):
-    """Variation across planes suits what reaches through them, and not objects that do not."""
-    weighted = reconstruct(seen, iterations=60, variation=TotalVariation(depth_weight=0.5))
-    plain = reconstruct(seen, iterations=60)
-    assert (shares(np.asarray(weighted.image), 1) < shares(np.asarray(plain.image), 1)).all()
 
 
 def measured(step, near, *, brightness=(1.0, 1.0), planes=4, noise=0.005):

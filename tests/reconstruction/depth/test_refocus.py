@@ -9,14 +9,10 @@ from reconstruction.depth import rig
 from reconstruction.rig import refused
 
 import thincam_jax as tc
-from helpers import compilations, finite_difference, quick
+from helpers import finite_difference
 from thincam_jax.reconstruction import fringe_scanning
 from thincam_jax.reconstruction.depth.find import depth_map, find_distances
-from thincam_jax.reconstruction.depth.refocus import (
-    axial_resolution,
-    refocus_distances,
-    refocus_sweep,
-)
+from thincam_jax.reconstruction.depth.refocus import axial_resolution, refocus_sweep
 from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.units import um
 
@@ -66,13 +62,6 @@ def test_a_direction_stays_where_it_is(recording):
             middle = rows @ np.arange(48) / rows.sum(), across @ np.arange(28) / across.sum()
             wanted = (21.5, 12.5 if columns.start == 0 else 14.5)
             np.testing.assert_allclose(middle, wanted, atol=0.8)
-
-
-@pytest.mark.parametrize("name", quick(SOLVERS, 1))
-def test_further_distances_compile_nothing(recording, name):
-    refocus_sweep(recording, DISTANCES[:3], SOLVERS[name])
-    further = (17.5, 31.0, 77.0)
-    assert compilations(lambda: refocus_sweep(recording, further, SOLVERS[name])) == 0
 
 
 def test_the_noise_of_all_images_is_that_of_the_captures(recording):
@@ -144,20 +133,6 @@ def test_measured_psfs_tell_the_distances():
     depth = depth_map(sweep)
     for box, wanted in zip(boxes, (16, 24), strict=True):
         assert np.median(depth.distance[box]) == pytest.approx(wanted, abs=2)
-
-
-@pytest.mark.thorough
-def test_planes_reconstructed_together_share_what_stands_between_them():
-    """Half-way between two planes a box is in both; on one of them it is in that."""
-    planes = np.stack([spots(scale) for scale in (1.0, 1.06)])
-    image = np.zeros((95, 127))
-    image[40:60, 50:80] = np.kron(np.indices((5, 6)).sum(0) % 2, np.ones((4, 5)))
-    for scale, least, most in ((1.0, 0.9, 1.0), (1.03, 0.3, 0.7), (1.06, 0.0, 0.1)):
-        capture = scipy.signal.fftconvolve(image, spots(scale))[47:95, 63:127]
-        capture += 1e-3 * capture.max() * np.random.default_rng(6).normal(size=capture.shape)
-        recording = tc.Recording(capture[None], tc.Psfs(planes[None, None]))
-        first, second = tc.reconstruct(recording, tc.AdmmTV(iterations=150)).image.sum((1, 2))
-        assert least < first / (first + second) < most
 
 
 def halves(t):
@@ -238,10 +213,3 @@ def test_another_mask_is_refused():
     camera = tc.LenslessCamera(sampled, tc.Sensor((8, 8), 20 * um), 3.0)
     with pytest.raises(TypeError, match="a FresnelZoneAperture only; the camera has a SampledMask"):
         axial_resolution(camera, object_distance=20.0)
-
-
-def test_distances_are_even_in_one_over_t():
-    distances = np.asarray(refocus_distances(100, 220.0, 7))
-    assert distances[0] == pytest.approx(100)
-    assert distances[-1] == pytest.approx(220)
-    np.testing.assert_allclose(np.diff(1 / distances), np.diff(1 / distances)[0], rtol=1e-9)

@@ -105,11 +105,6 @@ def test_a_file_of_a_colour_sensor(tmp_path):
     assert study.responses[1].centre == pytest.approx(535e-6) and len(study.responses) == 3
 
 
-def test_the_angle_of_a_file_is_the_tilt_of_the_plate(tmp_path):
-    config = tiny.experiment(tmp_path, "screen.tilt=[0.4 deg, -0.2 deg]")
-    np.testing.assert_allclose(build_screen(config).camera.tilt, np.deg2rad([0.4, -0.2]))
-
-
 @pytest.mark.thorough
 def test_progress_and_files(run):
     study, path, _, texts = run
@@ -174,21 +169,6 @@ def test_a_plate_that_guides_no_light_is_refused(override, part, tmp_path):
         build_screen(config)
 
 
-def test_cells_that_are_no_power_of_two_are_told_with_their_line(tmp_path):
-    text = tiny.TEXT.replace("[8, 16]", "[12, 16]")
-    told = r"tiny.yaml:\d+: object.cells: 12 × 16 = 192 cells are no power of two, as Hadamard"
-    with pytest.raises(ConfigError, match=told) as caught:
-        tiny.experiment(tmp_path, text=text)
-    assert str(caught.value).count("\n") == 0
-    tiny.experiment(tmp_path, "calibration=null", text=text)
-
-
-def test_a_camera_that_sees_nothing_is_refused(tmp_path):
-    config = tiny.experiment(tmp_path, "screen.bottom.y=900 mm")
-    with pytest.raises(ConfigError, match=r"tiny.yaml:\d+: screen: no ray .* off hologram"):
-        build_screen(config)
-
-
 def test_the_shipped_file(tmp_path):
     shipped = tiny.experiment(tmp_path, text=(ROOT / "configs/sts_camera.yaml").read_text("utf-8"))
     assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
@@ -248,3 +228,18 @@ def test_a_file_with_a_mask_in_place_of_the_lens(tmp_path):
     assert "1.4 mm (cosine), 6.5 mm before it" in page and "s shadow, once for each order" in page
     assert {p.stem for p in (tmp_path / "out/figures").iterdir()} == set(PICTURES[:5])
     assert stored(tmp_path / "out")["entries_of_the_system"] == 24 * 32 * 8 * 16
+
+
+def test_a_camera_that_sees_nothing_is_refused(tmp_path):
+    config = tiny.experiment(tmp_path, "screen.bottom.y=900 mm")
+    with pytest.raises(ConfigError, match=r"tiny.yaml:\d+: screen: no ray .* off hologram"):
+        build_screen(config)
+
+
+def test_cells_that_are_no_power_of_two_are_told_with_their_line(tmp_path):
+    text = tiny.TEXT.replace("[8, 16]", "[12, 16]")
+    told = r"tiny.yaml:\d+: object.cells: 12 × 16 = 192 cells are no power of two, as Hadamard"
+    with pytest.raises(ConfigError, match=told) as caught:
+        tiny.experiment(tmp_path, text=text)
+    assert str(caught.value).count("\n") == 0
+    tiny.experiment(tmp_path, "calibration=null", text=text)

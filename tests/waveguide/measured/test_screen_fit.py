@@ -119,12 +119,6 @@ def test_a_plate_that_leans():
 
 
 @pytest.mark.thorough
-def test_another_screen_is_a_poor_fit():
-    fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), parameters=("slant",))
-    assert fit.status == "poor_fit"
-
-
-@pytest.mark.thorough
 def test_a_screen_from_its_matrix(optimised):
     """In any unit; noise of 0.001 of the largest entries, and the colours' smear."""
     few = {"pixels": (11, 15), "pitch": 140.8 * um}

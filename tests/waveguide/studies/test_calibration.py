@@ -10,7 +10,7 @@ import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import nm
-from thincam_jax.waveguide.studies.calibration import calibrate, measure_matrix
+from thincam_jax.waveguide.studies.calibration import calibrate
 from thincam_jax.waveguide.studies.screen import ScreenModel
 
 pytestmark = pytest.mark.thorough
@@ -72,14 +72,6 @@ def test_total_variation_through_the_matrix():
     assert means["from the fit"].mean_psnr_db > means["measured there"].mean_psnr_db - 1
 
 
-@pytest.mark.parametrize("keep", [False, True])
-def test_captures_are_kept_where_asked_for(study, keep, tmp_path):
-    calibration = dataclasses.replace(tiny_screen.CALIBRATION, keep_captures=keep)
-    for _ in range(2):  # a store that was left behind is replaced
-        measure_matrix(study, calibration, study.systems[0], tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["captures-550mm.zarr"] * keep
-
-
 @pytest.fixture(scope="module")
 def colours():
     """Of three gratings and a sensor whose channels overlap."""
@@ -105,8 +97,3 @@ def test_colours_are_calibrated_with_their_cross_talk(colours):
     assert measured.images.shape == (1, 8, 16, 3)
     assert measured.scores.mean_psnr_db == pytest.approx(means["right"], abs=2)
     assert means["right"] > means["separated"] + 10
-
-
-def test_other_distances_are_of_one_colour(colours):
-    with pytest.raises(ValueError, match="distances need a fit, and that one colour; drop"):
-        calibrate(colours, tiny_screen.CALIBRATION)

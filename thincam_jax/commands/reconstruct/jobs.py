@@ -15,9 +15,8 @@ from thincam_jax._core.files import write_whole, writing
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.options import Background, Output, Sources
 from thincam_jax.measured import MeasurementError, write_image
-from thincam_jax.measured.dark import without_hot_pixels
 from thincam_jax.measured.examination import Examination, Finding, examine
-from thincam_jax.measured.merging import merge_images
+from thincam_jax.measured.merging import merge_images, without_hot_pixels
 from thincam_jax.measured.preparation import Background as Level
 from thincam_jax.measured.preparation import Prepared
 from thincam_jax.measured.raw import CaptureFileError

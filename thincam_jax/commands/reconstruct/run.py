@@ -13,12 +13,18 @@ import rich.progress
 from thincam_jax import measured
 from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError
-from thincam_jax._core.text import escaped
+from thincam_jax._core.table import escaped
 from thincam_jax.commands import terminal
-from thincam_jax.commands.interrupt import INTERRUPTED
 from thincam_jax.commands.reconstruct.jobs import Inputs, Job, write_job
 from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources
-from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
+from thincam_jax.commands.terminal import (
+    INTERRUPTED,
+    WRONG_INPUT,
+    in_a_line,
+    progress_bar,
+    say_result,
+    tell,
+)
 from thincam_jax.measured.examination import Finding, finding
 from thincam_jax.measured.preparation import Prepared
 from thincam_jax.measured.write import LINEAR, linear_bytes

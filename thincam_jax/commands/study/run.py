@@ -14,13 +14,18 @@ from thincam_jax.commands.report import (
 )
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, as_record
 from thincam_jax.commands.sections import StudyConfig
-from thincam_jax.imaging.display import as_picture
+from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
-from thincam_jax.studies.evaluate import Contrasts, Evaluation, Scores, evaluate_method
-from thincam_jax.studies.response import Response, method_response
-from thincam_jax.studies.result import StudyScores, findings, summarise
-from thincam_jax.studies.simulate import Capture, take
+from thincam_jax.studies.evaluate import (
+    Capture,
+    Contrasts,
+    Evaluation,
+    Scores,
+    evaluate_method,
+    take,
+)
+from thincam_jax.studies.result import Response, StudyScores, findings, method_response, summarise
 from thincam_jax.studies.study import Method, Study, Target
 
 _SCORED = (
@@ -151,7 +156,13 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
         Picture("mtf.png", "Transfer functions of all methods", _TRANSFER),
         Picture("contrast.png", "Contrast of chart elements", _CONTRAST),
     )
-    psf = (Picture("psf.png", "Point spread function", "Of the first capture."),)
+    psf = (
+        Picture(
+            "psf.png",
+            "Point spread function",
+            "The first capture's PSF, and a line through its middle.",
+        ),
+    )
     published = (Sentences(sentences), *config.notes) if sentences or config.notes else ()
     parts = (
         Part("Other reconstructions", [picture for pictures in others for picture in pictures]),

@@ -60,10 +60,9 @@ def sweep(
     with reported(interrupted):
         _check(scheduler, workers)
         from thincam_jax._core.precision import is_double
-        from thincam_jax.commands import explain
+        from thincam_jax.commands import run
         from thincam_jax.commands.kinds import load_study
-        from thincam_jax.commands.sweep.grid import read_axes
-        from thincam_jax.commands.sweep.point import doubts, make_points
+        from thincam_jax.commands.sweep.point import doubts, make_points, read_axes
         from thincam_jax.commands.sweep.run import SweepFolder, run_sweep
 
         study = load_study(config, tuple(set_ or ()), "a sweep takes a study")
@@ -71,7 +70,7 @@ def sweep(
         points = make_points(study, axes, is_double())
         folder = SweepFolder.chosen(out, f"{study.name}-sweep", study)
         if dry_run:
-            explain.dry_run(study, f"{len(points)} points; {folder.outcome(study)}")
+            run.explain_run(study, f"{len(points)} points; {folder.outcome(study)}")
             return
         folder.claim(study)
         warn(doubts(points))

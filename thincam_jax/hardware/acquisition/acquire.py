@@ -22,8 +22,7 @@ from thincam_jax._core.capture_store import (
     CaptureStoreError,
     dtype_of_bits,
 )
-from thincam_jax._core.text import of_error, shortened
-from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
+from thincam_jax._core.table import of_error, shortened
 from thincam_jax.hardware.acquisition.plan import BLACK, AcquisitionPlan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
     Recorder,
@@ -34,11 +33,9 @@ from thincam_jax.hardware.acquisition.recorder import (
     versions,
 )
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
-from thincam_jax.hardware.base import CameraSettings, Identity
-from thincam_jax.hardware.displays.settle import LONGEST, settle_calibrate
-from thincam_jax.hardware.displays.shutter import Shutter
-from thincam_jax.hardware.errors import NotHomed, OutOfRange
+from thincam_jax.hardware.acquisition.taker import Procedure, Taker, find_exposure, full_scale
+from thincam_jax.hardware.base import CameraSettings, Identity, NotHomed, OutOfRange
+from thincam_jax.hardware.displays.settle import LONGEST, Shutter, settle_calibrate
 
 
 @dataclass(frozen=True)

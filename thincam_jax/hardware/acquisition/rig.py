@@ -93,7 +93,7 @@ def open_rig(
     unknown options.
     """
     from thincam_jax.hardware.displays.patterns import pattern_levels
-    from thincam_jax.hardware.displays.shutter import Shutter
+    from thincam_jax.hardware.displays.settle import Shutter
     from thincam_jax.hardware.virtual.devices import VirtualDevices
 
     with ExitStack() as stack:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax.hardware import errors
-from thincam_jax.hardware.base import CameraSettings, Frame, Identity
+from thincam_jax.hardware import base
+from thincam_jax.hardware.base import CameraSettings, Frame, HardwareError, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
     FeatureCamera,
@@ -21,7 +21,6 @@ from thincam_jax.hardware.cameras.features import (
     text,
     trigger_by_software,
 )
-from thincam_jax.hardware.errors import HardwareError
 
 _BUFFERS = 4
 
@@ -72,9 +71,7 @@ class AravisCamera(FeatureCamera):
         )
         self._name = str(self.identity)
         if isinstance(device, self._aravis.GvDevice) and not device.is_controller():
-            raise errors.Busy(
-                self._name, "open", "another program controls it", "close that program"
-            )
+            raise base.Busy(self._name, "open", "another program controls it", "close that program")
         device.connect("control-lost", self._on_control_lost)
         self._camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         trigger_by_software(features)
@@ -143,7 +140,7 @@ class AravisCamera(FeatureCamera):
         status = buffer.get_status()
         if status != self._aravis.BufferStatus.SUCCESS:
             cause = f"packets are missing ({status.value_nick})"
-            raise errors.IncompleteFrame(
+            raise base.IncompleteFrame(
                 self._name, "grab", cause, "take it again; check the network"
             )
         data, region = buffer.get_data(), settings.region
@@ -151,7 +148,7 @@ class AravisCamera(FeatureCamera):
         pixels = np.frombuffer(data, np.uint8 if bits == 8 else np.dtype("<u2"))
         if region is None or pixels.size != region.height * region.width:
             cause = f"{len(data)} bytes, and {region} of {settings.pixel_format} is set"
-            raise errors.IncompleteFrame(self._name, "grab", cause, "take it again")
+            raise base.IncompleteFrame(self._name, "grab", cause, "take it again")
         number = self._count.number(buffer.get_frame_id())
         shaped = pixels.reshape(region.height, region.width)
         return Frame(shaped, number, 1e-9 * buffer.get_timestamp(), settings.exposure, bits)
@@ -169,8 +166,8 @@ class AravisCamera(FeatureCamera):
         except self._glib.Error as failure:
             raise self._error(operation, failure) from failure
 
-    def _gone(self, operation: str, cause: str) -> errors.Disconnected:
-        return errors.Disconnected(self._name, operation, cause, "connect it and open it again")
+    def _gone(self, operation: str, cause: str) -> base.Disconnected:
+        return base.Disconnected(self._name, operation, cause, "connect it and open it again")
 
     def _error(self, operation: str, failure: Any) -> HardwareError:
         cause, codes = failure.message, self._aravis.DeviceError
@@ -178,19 +175,19 @@ class AravisCamera(FeatureCamera):
         if code == codes.NOT_FOUND:
             found = [self._aravis.get_device_id(k) for k in range(self._aravis.get_n_devices())]
             remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
-            return errors.NotFound(self._name, operation, cause, remedy)
+            return base.NotFound(self._name, operation, cause, remedy)
         if code in (codes.NOT_CONTROLLER, codes.PROTOCOL_ERROR_ACCESS_DENIED) or "BUSY" in cause:
-            return errors.Busy(self._name, operation, cause, "close the program that holds it")
+            return base.Busy(self._name, operation, cause, "close the program that holds it")
         if "ACCESS" in cause:  # libusb's name for it
             remedy = "install aravis's udev rule (aravis.rules) and connect the camera again"
-            return errors.PermissionDenied(self._name, operation, cause, remedy)
+            return base.PermissionDenied(self._name, operation, cause, remedy)
         silent = codes.TIMEOUT, codes.NOT_CONNECTED, codes.TRANSFER_ERROR, codes.NO_STREAM_CHANNEL
         if code in silent:
             self._lost = True
             return self._gone(operation, cause)
         if "bounds" in cause or "out of range" in cause:
-            return errors.OutOfRange(self._name, operation, cause, "give a value within the limits")
-        return errors.ProtocolError(self._name, operation, cause, "open the camera again")
+            return base.OutOfRange(self._name, operation, cause, "give a value within the limits")
+        return base.ProtocolError(self._name, operation, cause, "open the camera again")
 
 
 def _libraries() -> tuple[Any, Any]:
@@ -205,7 +202,7 @@ def _libraries() -> tuple[Any, Any]:
             "apt-get install gir1.2-aravis-0.8 python3-gi, and in a virtual environment "
             "pip install 'PyGObject<3.51'"
         )
-        raise errors.NotFound(
+        raise base.NotFound(
             "aravis", "open", f"its library is missing ({error})", remedy
         ) from error
 

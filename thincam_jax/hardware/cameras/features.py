@@ -8,8 +8,7 @@ from collections.abc import Collection
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, runtime_checkable
 
-from thincam_jax.hardware.base import SOFTWARE, Camera, CameraSettings, Region
-from thincam_jax.hardware.errors import OutOfRange, Timeout
+from thincam_jax.hardware.base import SOFTWARE, Camera, CameraSettings, OutOfRange, Region, Timeout
 
 COLOURS = "Mono", "BayerGR", "BayerRG", "BayerGB", "BayerBG"
 BIT_DEPTHS = {f"{colour}{bits}": bits for colour in COLOURS for bits in (8, 10, 12, 16)}

@@ -9,10 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax._core.text import of_error
-from thincam_jax.hardware import errors
-from thincam_jax.hardware.base import SOFTWARE, Camera, CameraSettings, Frame, Identity, Region
-from thincam_jax.hardware.errors import HardwareError
+from thincam_jax._core.table import of_error
+from thincam_jax.hardware import base
+from thincam_jax.hardware.base import (
+    SOFTWARE,
+    Camera,
+    CameraSettings,
+    Frame,
+    HardwareError,
+    Identity,
+    Region,
+)
 
 _BITS = {f"Mono{bits}": bits for bits in (8, 10, 12, 14, 16)}
 _ROUNDING = 0.1  # of an exposure; a larger change is a limit
@@ -63,7 +70,7 @@ class PylablibCamera(Camera):
             import_module("pylablib")
         except ImportError as error:
             cause, install = f"its library is missing ({error})", "thincam-jax[pylablib]"
-            raise errors.NotFound("pylablib", "open", cause, f"pip install '{install}'") from error
+            raise base.NotFound("pylablib", "open", cause, f"pip install '{install}'") from error
 
     def _introduce(self, options: Options) -> None:
         camera, (module, _, kind) = self._camera, options.camera.partition(".")
@@ -177,11 +184,11 @@ class PylablibCamera(Camera):
         with suppress(Exception):
             self._camera.close()
 
-    def _refused(self, what: str, allowed: str) -> errors.OutOfRange:
-        return errors.OutOfRange(self._name, "configure", what, f"give {allowed}")
+    def _refused(self, what: str, allowed: str) -> base.OutOfRange:
+        return base.OutOfRange(self._name, "configure", what, f"give {allowed}")
 
-    def _incomplete(self, cause: str) -> errors.IncompleteFrame:
-        return errors.IncompleteFrame(self._name, "grab", cause, "take it again")
+    def _incomplete(self, cause: str) -> base.IncompleteFrame:
+        return base.IncompleteFrame(self._name, "grab", cause, "take it again")
 
     @contextmanager
     def _translated(self, operation: str, deadline: float = np.inf) -> Iterator[None]:
@@ -199,15 +206,15 @@ class PylablibCamera(Camera):
             there = self._camera.is_opened() and self._camera.get_exposure() > 0
         if self._camera is None:
             remedy = "connect it, install its maker's software, close other programs that use it"
-            return errors.NotFound(self._name, operation, cause, remedy)
+            return base.NotFound(self._name, operation, cause, remedy)
         if not there:
-            return errors.Disconnected(self._name, operation, cause, "connect it and open it again")
+            return base.Disconnected(self._name, operation, cause, "connect it and open it again")
         if late:
             remedy = "try again, allow more time, or connect its trigger"
-            return errors.Timeout(self._name, operation, "no frame came", remedy)
+            return base.Timeout(self._name, operation, "no frame came", remedy)
         if isinstance(error, self._camera.FrameTransferError):
             return self._incomplete(cause)
-        return errors.ProtocolError(self._name, operation, cause, "open the camera again")
+        return base.ProtocolError(self._name, operation, cause, "open the camera again")
 
 
 def _camera_class(name: str) -> Any:
@@ -219,5 +226,5 @@ def _camera_class(name: str) -> Any:
     except (ImportError, AttributeError) as error:
         cause = f"no camera {name!r} with an exposure and a region ({of_error(error)})"
         remedy = 'give camera, such as "Thorlabs.ThorlabsTLCamera"'
-        raise errors.NotFound("pylablib", "open", cause, remedy) from error
+        raise base.NotFound("pylablib", "open", cause, remedy) from error
     return found

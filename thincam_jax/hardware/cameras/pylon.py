@@ -7,8 +7,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from thincam_jax.hardware import errors
-from thincam_jax.hardware.base import CameraSettings, Connected, Frame, Identity
+from thincam_jax.hardware import base
+from thincam_jax.hardware.base import CameraSettings, Connected, Frame, HardwareError, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
     FeatureCamera,
@@ -18,7 +18,6 @@ from thincam_jax.hardware.cameras.features import (
     text,
     trigger_by_software,
 )
-from thincam_jax.hardware.errors import HardwareError
 
 with warnings.catch_warnings():
     # Raised as an error, SWIG's warning about its own types crashes the interpreter.
@@ -85,7 +84,7 @@ class PylonCamera(FeatureCamera):
             found = [info.GetSerialNumber() for info in factory.EnumerateDevices()]
             cause = f"no camera {options.serial}".rstrip()
             remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
-            raise errors.NotFound("pylon", "open", cause, remedy) from error
+            raise base.NotFound("pylon", "open", cause, remedy) from error
         return cls(camera)
 
     def flush(self) -> None:
@@ -135,13 +134,11 @@ class PylonCamera(FeatureCamera):
     def _frame(self, result: Any, settings: CameraSettings) -> Frame:
         if not result.GrabSucceeded():
             cause = result.ErrorDescription or f"pylon's error {result.ErrorCode:#x}"
-            raise errors.IncompleteFrame(
-                self._name, "grab", cause, "take it again; check the cable"
-            )
+            raise base.IncompleteFrame(self._name, "grab", cause, "take it again; check the cable")
         pixels, region = result.Array, settings.region
         if region is None or pixels.shape != (region.height, region.width):
             cause = f"{pixels.shape} pixels, and {region} is set"
-            raise errors.ProtocolError(self._name, "grab", cause, "configure the camera again")
+            raise base.ProtocolError(self._name, "grab", cause, "configure the camera again")
         # The emulator has no clock.
         moment = result.TimeStamp * self._tick if result.TimeStamp else time.monotonic()
         bits = BIT_DEPTHS[settings.pixel_format]
@@ -164,7 +161,7 @@ class PylonCamera(FeatureCamera):
             failure = error
         if self._camera.IsCameraDeviceRemoved():
             remedy = "connect it and open it again"
-            raise errors.Disconnected(self._name, operation, "it was removed", remedy) from failure
+            raise base.Disconnected(self._name, operation, "it was removed", remedy) from failure
         if isinstance(failure, HardwareError):
             raise failure
         if failure is not None:
@@ -175,13 +172,13 @@ class PylonCamera(FeatureCamera):
         if isinstance(failure, genicam.TimeoutException):
             return self._timeout(operation, cause)
         if isinstance(failure, genicam.OutOfRangeException):
-            return errors.OutOfRange(self._name, operation, cause, "give a value within the limits")
+            return base.OutOfRange(self._name, operation, cause, "give a value within the limits")
         if operation == "open" and "another" in cause:
-            return errors.Busy(self._name, operation, cause, "close the program that holds it")
+            return base.Busy(self._name, operation, cause, "close the program that holds it")
         if operation == "open" and "permission" in cause.lower():
             remedy = "install pylon's udev rule (setup-usb.sh) and connect the camera again"
-            return errors.PermissionDenied(self._name, operation, cause, remedy)
-        return errors.ProtocolError(self._name, operation, cause, "open the camera again")
+            return base.PermissionDenied(self._name, operation, cause, remedy)
+        return base.ProtocolError(self._name, operation, cause, "open the camera again")
 
 
 class _Features:

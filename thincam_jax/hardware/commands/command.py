@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thincam_jax.commands.explore import Browser, Port, serve_page
+from thincam_jax.commands.run import Browser, Port, serve_page
 from thincam_jax.commands.terminal import (
     ConfigFile,
     DryRun,
@@ -56,13 +56,13 @@ def capture(
 
     with reported(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import write_whole
-        from thincam_jax.commands import explain
+        from thincam_jax.commands import run
         from thincam_jax.commands.checked_config import dump_config
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.run_folder import to_json
         from thincam_jax.hardware.acquisition.acquire import acquire
-        from thincam_jax.hardware.errors import HardwareError
+        from thincam_jax.hardware.base import HardwareError
 
         asked = load_experiment(config, tuple(set_ or ()), "capture")
         store = out or Path("runs") / f"{slug(asked.name)}.zarr"
@@ -70,7 +70,7 @@ def capture(
             raise ConfigError(f"--out {store} exists; --resume goes on with it, else give another")
         plan = build_plan(asked)
         if dry_run:
-            explain.dry_run(asked, f"writes to {store}: {len(plan.steps)} frames", plan)
+            run.explain_run(asked, f"writes to {store}: {len(plan.steps)} frames", plan)
             return
         kept = f"0 of {len(plan.steps)} frames are kept"
         procedure = asked.acquisition.build(settle=asked.display.settle)
@@ -110,8 +110,8 @@ def preview(
     """
     with reported(lambda: "interrupted"):
         from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.hardware.base import HardwareError
         from thincam_jax.hardware.commands.run import build_study
-        from thincam_jax.hardware.errors import HardwareError
         from thincam_jax.hardware.preview import Preview
         from thincam_jax.hardware.studies.images import live_image
 
@@ -159,11 +159,11 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
 def known_drivers(connected: bool = False, asked: str | None = None) -> list[str]:
     """A line for each driver; each device that is there; what answers at a serial port."""
     from thincam_jax.commands.config_file import ConfigError
-    from thincam_jax.hardware import discovery, registry
-    from thincam_jax.hardware.errors import HardwareError
+    from thincam_jax.hardware import registry
+    from thincam_jax.hardware.base import HardwareError
 
     try:
-        there = discovery.report(asked) if connected or asked else []
+        there = registry.report(asked) if connected or asked else []
     except HardwareError as error:
         raise ConfigError(str(error)) from None
     return registry.driver_report() + there
@@ -259,7 +259,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     from thincam_jax._core.files import read_json
     from thincam_jax.hardware.acquisition.read import Acquisition
     from thincam_jax.hardware.commands.run import Taken, picture_levels
-    from thincam_jax.hardware.displays.grey_levels import measured_levels
+    from thincam_jax.hardware.displays.levels import measured_levels
     from thincam_jax.hardware.displays.patterns import pattern_levels
     from thincam_jax.hardware.studies.rig import CountingCamera, RigFrames
     from thincam_jax.hardware.virtual.rig import FIDUCIAL_SHAPE, Electronics

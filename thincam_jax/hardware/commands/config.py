@@ -24,7 +24,7 @@ from thincam_jax.hardware.acquisition.request import MONITOR, PlanRequest
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.cameras.features import BIT_DEPTHS
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.hardware.virtual.optics import MonitorPose
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor

@@ -28,7 +28,7 @@ from thincam_jax.hardware.studies.rig import (
     reconstruct_pictures,
     recover_to,
 )
-from thincam_jax.imaging.display import as_picture
+from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.measured import write_image

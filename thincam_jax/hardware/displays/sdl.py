@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax.hardware.base import Connected, Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
-from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
+from thincam_jax.hardware.base import Connected, Disconnected, Identity, NotFound, ProtocolError
+from thincam_jax.hardware.displays.levels import GreyLevelDisplay, GreyLevels
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it reports which SDL libraries it has found

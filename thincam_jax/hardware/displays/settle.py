@@ -1,4 +1,4 @@
-r"""Settling time of a display, after which a frame shows nothing of the previous pattern.
+r"""Settling time of a display, and the person who covers the camera for dark frames.
 
 Two patterns A and B are shown in turn. With the difference D of their settled frames, a frame
 :math:`f` exposed a time t after the change from A to B contains the fraction
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thincam_jax.hardware.base import Camera, Display, grab
-from thincam_jax.hardware.errors import OutOfRange, Timeout
+from thincam_jax.hardware.base import Camera, Display, Identity, NotFound, OutOfRange, Timeout, grab
 
 LONGEST = 0.5  # s, after which a display counts as settled
 _SHOTS = 4  # of each measured fraction
@@ -146,3 +145,48 @@ class _Rig:
 
     def _grab(self) -> np.ndarray:
         return grab(self._camera, self._timeout).pixels.astype(float)
+
+
+class Shutter(Display):
+    """Shutter by hand for a camera without a display: a black pattern asks to cover it.
+
+    A pattern is one level. The camera is taken for open at first, except after `forget`.
+
+    - `display`: a phase modulator, on which no pattern is dark, and which shows the others.
+    """
+
+    shape = (1, 1)
+    identity = Identity("thincam_jax", "shutter by hand", "1")
+
+    @dataclass(frozen=True)
+    class Options:
+        """None."""
+
+    def __init__(self, options: Options, display: Display | None = None):
+        self._is_open: bool | None = True
+        self._display = display
+        if display is not None:
+            self.shape, self.identity = display.shape, display.identity
+
+    def forget(self) -> None:
+        """Ask at the next pattern, whichever it is: an earlier run may have left a cover."""
+        self._is_open = None
+
+    def show(self, pattern: np.ndarray) -> None:
+        wanted = bool(pattern.any())
+        if wanted != self._is_open:
+            action = "uncover" if wanted else "cover"
+            try:
+                input(f"{action} the camera, then press Enter: ")
+            except EOFError as error:
+                raise NotFound(
+                    str(self.identity), f"{action} the camera", "nobody answers at a terminal",
+                    "begin it in one, or set dark_frames to 0"
+                ) from error  # fmt: skip
+        self._is_open = wanted
+        if wanted and self._display is not None:
+            self._display.show(pattern)
+
+    def close(self) -> None:
+        if self._display is not None:
+            self._display.close()

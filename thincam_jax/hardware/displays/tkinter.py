@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevelDisplay, GreyLevels
-from thincam_jax.hardware.errors import Disconnected, NotFound
+from thincam_jax.hardware.base import Disconnected, Identity, NotFound
+from thincam_jax.hardware.displays.levels import GreyLevelDisplay, GreyLevels
 
 
 class TkinterDisplay(GreyLevelDisplay):

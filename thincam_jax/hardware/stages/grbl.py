@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from thincam_jax._core.arguments import checked
-from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import Disconnected, HardwareError, ProtocolError, Timeout
+from thincam_jax.hardware.base import Disconnected, HardwareError, Identity, ProtocolError, Timeout
 from thincam_jax.hardware.stages import serial_stage
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
 from thincam_jax.hardware.stages.serial_stage import Answer, Report, SerialOptions, SerialStage

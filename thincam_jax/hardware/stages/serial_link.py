@@ -12,7 +12,7 @@ from typing import TextIO
 import serial
 from serial.tools import list_ports
 
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Busy,
     Disconnected,
     HardwareError,

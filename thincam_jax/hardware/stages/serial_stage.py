@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 from thincam_jax._core.arguments import checked
-from thincam_jax.hardware import errors
-from thincam_jax.hardware.base import Stage
-from thincam_jax.hardware.errors import HardwareError, NotHomed, ProtocolError, Timeout
+from thincam_jax.hardware import base
+from thincam_jax.hardware.base import HardwareError, NotHomed, ProtocolError, Stage, Timeout
 from thincam_jax.hardware.stages.serial_link import SerialLink
 
 POLL = 0.005  # s between two queries of a moving stage
@@ -102,7 +101,7 @@ class SerialStage(Stage):
         low, high = self.limits
         if not low <= position <= high:  # NaN, too
             remedy = f"give a position from {low:g} to {high:g} mm"
-            raise errors.OutOfRange(self._link.name, "move", f"{position:g} mm", remedy)
+            raise base.OutOfRange(self._link.name, "move", f"{position:g} mm", remedy)
         self._check_homed("move")
         stops, stood = self._stops, time.monotonic()
         deadline = stood + timeout
@@ -169,7 +168,7 @@ class SerialStage(Stage):
                 return answer
             if time.monotonic() > end:
                 remedy = "end what else uses the stage, then try again"
-                raise errors.Busy(self._link.name, command, cause, remedy)
+                raise base.Busy(self._link.name, command, cause, remedy)
             time.sleep(POLL)
 
     def _check_homed(self, operation: str) -> None:

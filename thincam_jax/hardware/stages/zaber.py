@@ -10,8 +10,7 @@ import time
 from dataclasses import dataclass
 
 from thincam_jax._core.arguments import checked
-from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import NotHomed, ProtocolError, Timeout
+from thincam_jax.hardware.base import Identity, NotHomed, ProtocolError, Timeout
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
 from thincam_jax.hardware.stages.serial_stage import POLL, Report, SerialOptions, SerialStage
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.imaging.display import as_picture
+from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured.bayer import Pattern, colour_sites, demosaic, demosaic_mask
 from thincam_jax.reconstruction.methods import AdmmTV, reconstruct

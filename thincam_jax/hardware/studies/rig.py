@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax.hardware.studies.images import FrameSolver, square_field
-from thincam_jax.imaging.display import as_picture
+from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import CropConvolution, ReducedMatrix, Sparse
 from thincam_jax.imaging.operators.low_rank import LowRank
@@ -39,14 +39,13 @@ from thincam_jax.measured.calibration.system_matrix import open_matrix, stored_b
 from thincam_jax.reconstruction import AbstractSolver
 from thincam_jax.reconstruction.noise import estimate_noise
 from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.studies.evaluate import rounded, sample
+from thincam_jax.studies.evaluate import noise_free, rounded, sample
 from thincam_jax.studies.pictures import (
     Reconstructed,
     ScreenCaptures,
     diagonal_cells,
     reconstructed,
 )
-from thincam_jax.studies.simulate import noise_free
 from thincam_jax.studies.study import Study
 
 Pixels = tuple[slice, slice]

@@ -5,18 +5,198 @@ emulator for pylon, Zaber and GRBL on pseudo-terminals. Only a display has no pr
 listens on a network. Where the library of a driver is missing, a plain device takes its place.
 """
 
+import dataclasses
 import logging
-from collections.abc import Mapping
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
-from typing import Any
+from importlib.metadata import version
+from typing import Any, Literal, get_args
+
+import numpy as np
 
 from thincam_jax.hardware import registry
-from thincam_jax.hardware.base import Camera, Display, Stage
-from thincam_jax.hardware.errors import NotFound
-from thincam_jax.hardware.virtual.display import VirtualDisplay
-from thincam_jax.hardware.virtual.faults import Faults
-from thincam_jax.hardware.virtual.plain import PlainCamera, PlainStage
+from thincam_jax.hardware.base import (
+    SOFTWARE,
+    Camera,
+    CameraSettings,
+    Display,
+    Frame,
+    Identity,
+    NotFound,
+    NotHomed,
+    OutOfRange,
+    Region,
+    Stage,
+)
+from thincam_jax.hardware.cameras.features import BIT_DEPTHS
+from thincam_jax.hardware.displays.levels import GreyLevelDisplay, GreyLevels
 from thincam_jax.hardware.virtual.rig import VirtualRig
+
+Fault = Literal[
+    "latency",  # the answer or the frame comes late, within the timeout
+    "stale_frame",  # the previous frame, with its old number
+    "short_frame",  # part of the payload is missing
+    "dropped_frame",  # no frame comes
+    "unplug",  # the device disconnects, and can be reopened
+    "nak",  # the device refuses a valid command
+    "busy",  # the device is not ready
+    "lost_steps",  # the stage is not at its commanded position
+    "wrong_checksum",  # the answer's checksum is wrong
+]
+FAULTS: tuple[Fault, ...] = get_args(Fault)
+
+
+class Faults:
+    """Pending faults of a device; thread-safe.
+
+    `inject` adds one; the device calls `due` where the fault would occur, and plays it if that is
+    True. `happened` counts the played ones.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: Counter[Fault] = Counter()
+        self.happened: Counter[Fault] = Counter()
+
+    def inject(self, fault: Fault, times: int = 1) -> None:
+        """Add a fault, `times` times."""
+        if fault not in FAULTS:
+            raise ValueError(f"{fault!r} is no fault; give one of {', '.join(FAULTS)}")
+        with self._lock:
+            self._waiting[fault] += times
+
+    def due(self, fault: Fault) -> bool:
+        """Whether to play this fault now; consumes one."""
+        with self._lock:
+            if not self._waiting[fault]:
+                return False
+            self._waiting[fault] -= 1
+            self.happened[fault] += 1
+            return True
+
+    def waiting(self) -> bool:
+        """Whether faults are pending."""
+        with self._lock:
+            return self._waiting.total() > 0
+
+
+TRAVEL = 50.0  # mm, of virtual stages
+
+
+class PlainCamera(Camera):
+    """A camera whose frames come from a function.
+
+    - `expose`: returns the counts (y, x) of a frame exposed now, within the settings' region.
+    - `shape`: rows and columns of its sensor.
+    """
+
+    def __init__(self, expose: Callable[[CameraSettings], np.ndarray], shape: tuple[int, int]):
+        self.identity = Identity("thincam_jax", "plain camera", "virtual", version("thincam_jax"))
+        self._expose, self._shape, self._number = expose, shape, 0
+        self._settings = self.configure(CameraSettings(1e-3, pixel_format="Mono8"))
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        return self._shape
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        rows, columns = (n // settings.binning for n in self._shape)
+        region = settings.region or Region(0, 0, rows, columns)
+        if region.top + region.height > rows or region.left + region.width > columns:
+            raise self._refused(f"{region} on {rows} × {columns} pixels", "a smaller region")
+        if settings.pixel_format not in BIT_DEPTHS:
+            raise self._refused(settings.pixel_format, f"one of {', '.join(BIT_DEPTHS)}")
+        if settings.trigger != SOFTWARE:
+            raise self._refused(f"trigger {settings.trigger}", SOFTWARE)
+        self._settings = dataclasses.replace(settings, region=region)
+        return self._settings
+
+    def flush(self) -> None:
+        pass  # no frame waits
+
+    def trigger_and_grab(self, timeout: float) -> Frame:
+        self._number += 1
+        settings, now = self._settings, time.monotonic()
+        bits = BIT_DEPTHS[settings.pixel_format]
+        return Frame(self._expose(settings), self._number, now, settings.exposure, bits)
+
+    def close(self) -> None:
+        pass
+
+    def _refused(self, what: str, allowed: str) -> OutOfRange:
+        return OutOfRange(str(self.identity), "configure", what, f"give {allowed}")
+
+
+class PlainStage(Stage):
+    """A stage that is at once where it is sent; `on_move` gets its position, mm."""
+
+    def __init__(self, on_move: Callable[[float], None]):
+        self.identity = Identity("thincam_jax", "plain stage", "virtual", version("thincam_jax"))
+        self.limits, self._on_move = (0.0, TRAVEL), on_move
+        self._position: float | None = None
+
+    @property
+    def homed(self) -> bool:
+        return self._position is not None
+
+    def home(self, timeout: float = 60.0) -> None:
+        self._position = 0.0
+        self._on_move(0.0)
+
+    def move_to(self, position: float, timeout: float = 60.0) -> float:
+        low, high = self.limits
+        if not low <= position <= high:
+            what = f"{position:g} mm"
+            raise OutOfRange(str(self.identity), "move", what, f"give {low:g} to {high:g} mm")
+        self.position()
+        self._position = round(position, 3)
+        self._on_move(self._position)
+        return self._position
+
+    def position(self) -> float:
+        if self._position is None:
+            raise NotHomed(str(self.identity), "move", "its position is unknown", "home it before")
+        return self._position
+
+    def stop(self) -> None:
+        pass  # at rest at once
+
+    def close(self) -> None:
+        pass
+
+
+_LATENCY = 0.05  # s
+
+
+class VirtualDisplay(GreyLevelDisplay):
+    """A display that calls `on_show` with the levels (y, x), uint8, of each pattern.
+
+    `faults`: plays latency, a late `show`.
+    """
+
+    identity = Identity("thincam_jax", "virtual display", "virtual", version("thincam_jax"))
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        on_show: Callable[[np.ndarray], None],
+        *,
+        faults: Faults | None = None,
+        grey_levels: GreyLevels | None = None,
+    ):
+        super().__init__(grey_levels)
+        self.shape, self._on_show, self._faults = shape, on_show, faults or Faults()
+
+    def close(self) -> None:
+        pass
+
+    def _present(self, levels: np.ndarray) -> None:
+        if self._faults.due("latency"):
+            time.sleep(_LATENCY)
+        self._on_show(levels)
 
 
 class VirtualDevices(AbstractContextManager["VirtualDevices"]):

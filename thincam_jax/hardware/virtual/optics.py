@@ -17,19 +17,17 @@ from scipy.spatial.transform import Rotation
 from thincam_jax._core.grids import Grid, block_mean, centred_indices
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import check_fields, quantity
-from thincam_jax.hardware.displays.phase_levels import PhaseLevels
+from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.sampled import SampledMask
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable import pixel_nodes
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
 from thincam_jax.measured.bayer import Pattern, mosaic
 from thincam_jax.measured.calibration.alignment import to_indices
 

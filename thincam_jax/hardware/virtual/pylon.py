@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from thincam_jax.hardware.base import CameraSettings, Frame
+from thincam_jax.hardware.base import CameraSettings, Frame, OutOfRange
 from thincam_jax.hardware.cameras.features import BIT_DEPTHS
 from thincam_jax.hardware.cameras.pylon import PylonCamera, pylon
-from thincam_jax.hardware.errors import OutOfRange
-from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.devices import Faults
 
 _EMULATOR = "BaslerCamEmu"
 _LATENCY = 0.05  # s

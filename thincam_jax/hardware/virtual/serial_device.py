@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from thincam_jax.hardware.virtual.faults import Faults
-from thincam_jax.hardware.virtual.plain import TRAVEL
+from thincam_jax.hardware.virtual.devices import TRAVEL, Faults
 
 TICK = 0.002  # s between two updates of a moving slide
 LONGEST_INPUT = 1024  # bytes kept of an unfinished line

@@ -31,7 +31,7 @@ from thincam_jax.hardware.cameras.usb3_vision.stream import (
     TRAILER_MAGIC,
     frame_bytes,
 )
-from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.devices import Faults
 
 CONTROL_OUT, CONTROL_IN, STREAM_IN = 0x01, 0x81, 0x82
 LATE = 0.02  # s

@@ -17,7 +17,7 @@ from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 from thincam_jax._core.checks import Shape
 from thincam_jax._core.files import read_arrays, write_whole
 from thincam_jax._core.precision import product
-from thincam_jax._core.text import of_error
+from thincam_jax._core.table import of_error
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
     real_numbers,
@@ -25,8 +25,7 @@ from thincam_jax.imaging.operators.base import (
     require_size,
 )
 from thincam_jax.imaging.operators.masked import Scaled
-from thincam_jax.imaging.operators.matrix import Matrix
-from thincam_jax.imaging.operators.sparse import Sparse
+from thincam_jax.imaging.operators.matrix import Matrix, Sparse
 
 # Numbers of H in the memory at a time: 128 MB in float32.
 _BLOCK = 2**25

@@ -31,7 +31,7 @@ def train(
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with reported(lambda: goes_on):
-        from thincam_jax.commands import explain
+        from thincam_jax.commands import run
         from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.learn.commands.training import InFolder, TrainingFolder
 
@@ -41,7 +41,7 @@ def train(
         if dry_run:
             InFolder(folder, lambda _: None, resume).check(asked)
             kind.part(kind.build)(asked)
-            explain.dry_run(asked, folder.outcome(asked))
+            run.explain_run(asked, folder.outcome(asked))
             return
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")

@@ -17,10 +17,9 @@ from thincam_jax.learn.commands.training import (
     SourceConfig,
 )
 from thincam_jax.learn.denoiser import pictures
-from thincam_jax.learn.denoiser.network import Denoiser, DenoiserOptions, create
+from thincam_jax.learn.denoiser.network import Denoiser, DenoiserOptions, DenoisingUNet, create
 from thincam_jax.learn.denoiser.pictures import Pictures, united
 from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
-from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.plot import draw_losses
 from thincam_jax.learn.refocusing import sources, unet
 from thincam_jax.learn.training import TrainingOptions

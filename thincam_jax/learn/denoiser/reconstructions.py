@@ -1,4 +1,4 @@
-r"""Lessons of reconstruction: a denoiser learns inside plug and play, behind drawn cameras.
+"""Lessons of reconstruction: a denoiser learns inside plug and play, behind drawn cameras.
 
 What a data step leaves is not white: it has the noise of some frequencies, and the errors that the
 denoiser made before at those that the camera hardly shows. The whole course of `PlugAndPlay` is
@@ -6,22 +6,201 @@ therefore differentiated, data steps by the implicit function theorem (Zhang, va
 USRNet, CVPR 2020, learn so behind blurs). No camera of a user is among those drawn.
 """
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Float32, PRNGKeyArray
+from scipy import ndimage
 
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.learn import plug_and_play
-from thincam_jax.learn.denoiser.crops import Crops, draw_crops
-from thincam_jax.learn.denoiser.drawn_cameras import drawn_kernels
-from thincam_jax.learn.denoiser.network import denoised
-from thincam_jax.learn.denoiser.unet import DenoisingUNet
+from thincam_jax.learn.denoiser.network import LEAST, MOST, DenoisingUNet, denoised
 from thincam_jax.reconstruction.normal_equations import normal_equations
 from thincam_jax.reconstruction.problem import InverseProblem, back_projected, uniform_image
+
+# ln of the exponents and factors that change the contrast of a crop.
+_GAMMA, _GAIN = (-0.9, 0.3), (-0.8, 0.5)
+# Standard deviation of an offset subtracted from a crop beside its mean: in a large image, local
+# means differ from the mean of the whole.
+_OFFSET = 0.15
+# Added to MSE/σ²: the root's slope stays finite.
+_LEAST_ERROR = 1e-4
+
+
+class Crops(eqx.Module):
+    """Noisy crops and what is to be found in them; see `denoised` for `centre`."""
+
+    clean: Float[Array, "image y x"]
+    noisy: Float[Array, "image y x"]
+    sigma: Float[Array, " image"]
+    centre: Float[Array, " image"]
+
+
+@eqx.filter_jit
+def draw_crops(
+    tiles: Float[Array, "tile side side 3"], batch: int, crop: int, key: PRNGKeyArray
+) -> Crops:
+    """Crops of tiles, turned and mirrored, in changed contrast, with noise of all levels.
+
+    Grey is a random mixture of the three colours. Half of the crops are linear light, the others
+    powers of it. ln σ is uniform, stratified over the batch.
+    """
+    keys = iter(jax.random.split(key, 12))
+    count, side = tiles.shape[:2]
+    chosen = jax.random.randint(next(keys), (batch,), 0, count)
+    corner = jax.random.randint(next(keys), (batch, 2), 0, side - crop + 1)
+
+    def cut(tile, place):
+        return jax.lax.dynamic_slice(tiles, (tile, *place, 0), (1, crop, crop, 3))[0]
+
+    mixture = jax.random.dirichlet(next(keys), jnp.ones(3, tiles.dtype), (batch,), tiles.dtype)
+    clean = jnp.einsum("byxc,bc->byx", jax.vmap(cut)(chosen, corner), mixture, precision="highest")
+    turned = jax.random.bernoulli(next(keys), shape=(3, batch, 1, 1))
+    clean = jnp.where(turned[0], clean[:, ::-1], clean)
+    clean = jnp.where(turned[1], clean[:, :, ::-1], clean)
+    clean = jnp.where(turned[2], jnp.swapaxes(clean, 1, 2), clean)
+
+    def uniform(low: float, high: float):
+        return jax.random.uniform(next(keys), (batch, 1, 1), tiles.dtype, low, high)
+
+    is_linear = jax.random.bernoulli(next(keys), shape=(batch, 1, 1))
+    # A power below 1 has no finite slope at 0, which nothing is differentiated by here.
+    power = jnp.where(is_linear, jnp.ones((), tiles.dtype), jnp.exp(uniform(*_GAMMA)))
+    clean = clean**power * jnp.exp(uniform(*_GAIN))
+    strata = jnp.arange(batch, dtype=tiles.dtype) + uniform(0.0, 1.0)[:, 0, 0]
+    spread = math.log(MOST / LEAST) / batch
+    sigma = LEAST * jnp.exp(spread * strata)
+    noise = jax.random.normal(next(keys), clean.shape, tiles.dtype)
+    noisy = clean + sigma[:, None, None] * noise
+    offset = _OFFSET * jax.random.normal(next(keys), (batch,), tiles.dtype)
+    return Crops(clean, noisy, sigma, jnp.mean(noisy, axis=(1, 2)) + offset)
+
+
+def loss(network: DenoisingUNet, crops: Crops) -> tuple[Array, dict[str, Array]]:
+    """Mean of RMSE/√σ: what good denoisers leave grows about as √σ, so all levels weigh the same.
+
+    A logarithm of the error would weigh flat crops as much as those with detail.
+    """
+    found = denoised(network, crops.noisy, crops.sigma, crops.centre)
+    error = jnp.mean((found - crops.clean) ** 2, axis=(1, 2)) / crops.sigma**2
+    value = jnp.mean(jnp.sqrt((error + _LEAST_ERROR) * crops.sigma))
+    return value, {"error": jnp.mean(error)}
+
+
+_FINER = 3  # samples of a shadow along a side of a pixel
+_ORDERS = (17, 31, 43, 61, 73, 101)  # of uniformly redundant arrays
+
+
+def drawn_kernels(
+    rng: np.random.Generator, side: int, width: float, captures: int
+) -> Float32[np.ndarray, "capture side side"]:
+    """PSFs of one camera on a grid of `side` pixels, whose mask's shadow is some `width` wide.
+
+    Six of ten single captures are of zone plates, two of uniformly redundant arrays, the others
+    of random cells, diffusers or lenslets. Several are of zone plates in other phases, or of two
+    plates or distances in two phases each. Their response to any frequency is at most 1 in all.
+    """
+    if captures > 1:
+        kernels = _stack_of_zones(rng, side, width, captures)
+    else:
+        kinds = [_zones] * 6 + [_uniformly_redundant] * 2 + [_cells, _diffuser, _lenslets]
+        draw: Callable[..., np.ndarray] = kinds[rng.integers(len(kinds))]
+        kernels = draw(rng, side, width)[None]
+    blur = rng.uniform(0, 0.9)  # of diffraction and the pixels
+    kernels = np.stack([ndimage.gaussian_filter(kernel, blur) for kernel in kernels])
+    response = np.sum(np.abs(np.fft.rfft2(kernels)) ** 2, axis=0).max() ** 0.5
+    return (kernels / response).astype(np.float32)
+
+
+def _places(side: int) -> np.ndarray:
+    count = side * _FINER
+    return (np.arange(count) - (count - 1) / 2) / _FINER
+
+
+def _on_pixels(shadow: np.ndarray) -> np.ndarray:
+    side = len(shadow) // _FINER
+    return shadow.reshape(side, _FINER, side, _FINER).mean(axis=(1, 3))
+
+
+def _zone_rate(rng: np.random.Generator, width: float) -> float:
+    """β of cos(βr²), so that zones at the edge have 0.1 to 0.5 cycles per pixel."""
+    return np.pi * np.exp(rng.uniform(np.log(0.1), np.log(0.5))) / (width / 2)
+
+
+def _zone_plate(side: int, width: float, rate: float, phase: float, *, binary: bool) -> np.ndarray:
+    squared = _places(side)[:, None] ** 2 + _places(side) ** 2
+    plate = (1 + np.cos(rate * squared + phase)) / 2
+    plate = (plate > 0.5).astype(float) if binary else plate
+    return _on_pixels(plate * (squared < (width / 2) ** 2))
+
+
+def _zones(rng: np.random.Generator, side: int, width: float) -> np.ndarray:
+    phase = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else 0.0
+    return _zone_plate(side, width, _zone_rate(rng, width), phase, binary=rng.random() < 0.3)
+
+
+def _stack_of_zones(
+    rng: np.random.Generator, side: int, width: float, captures: int
+) -> list[np.ndarray]:
+    first = rate, width = _zone_rate(rng, width), width
+    second = rate * np.exp(rng.uniform(-0.4, 0.4)), width * np.exp(rng.uniform(-0.2, 0.2))
+    settings = [first] * captures if rng.random() < 0.4 else [first, second] * (captures // 2)
+    turn = 2 * np.pi / captures if settings[0] == settings[-1] else np.pi / captures
+    return [
+        _zone_plate(side, wide, of, number * turn, binary=False)
+        for number, (of, wide) in enumerate(settings)
+    ]
+
+
+def _enlarged(side: int, width: float, pattern: np.ndarray) -> np.ndarray:
+    """Cells of a pattern, each at least a pixel wide."""
+    count = len(pattern)
+    cell = np.floor(_places(side) / max(width / count, 1.0) + count / 2).astype(int)
+    inside = (cell >= 0) & (cell < count)
+    cell = np.clip(cell, 0, count - 1)
+    return _on_pixels(pattern[np.ix_(cell, cell)] * np.outer(inside, inside))
+
+
+def _uniformly_redundant(rng: np.random.Generator, side: int, width: float) -> np.ndarray:
+    """Modified uniformly redundant array (Gottesman, Fenimore, Appl. Opt. 28, 4344, 1989)."""
+    order = int(rng.choice(_ORDERS))
+    sign = np.full(order, -1)
+    sign[np.arange(1, order) ** 2 % order] = 1
+    pattern = (np.outer(sign, sign) > 0).astype(float)
+    pattern[0], pattern[1:, 0] = 0, 1
+    return _enlarged(side, width, np.roll(pattern, (order // 2, order // 2), (0, 1)))
+
+
+def _cells(rng: np.random.Generator, side: int, width: float) -> np.ndarray:
+    count = int(rng.integers(16, 120))
+    is_open = rng.random((count, count)) < rng.uniform(0.15, 0.6)
+    return _enlarged(side, width, is_open.astype(float))
+
+
+def _diffuser(rng: np.random.Generator, side: int, width: float) -> np.ndarray:
+    """Caustics: each ray is turned by the slope of a smooth relief."""
+    count = int(width)
+    squared = np.fft.fftfreq(count)[:, None] ** 2 + np.fft.fftfreq(count) ** 2
+    smooth = np.exp(-rng.uniform(100, 1500) * squared)
+    relief = np.fft.ifft2(np.fft.fft2(rng.standard_normal((count, count))) * smooth).real
+    turn = np.exp(rng.uniform(np.log(8), np.log(60))) / relief.std()
+    y, x = (np.indices((count, count))[k] + turn * np.gradient(relief, axis=k) for k in (0, 1))
+    edges = np.arange(side + 1) - 0.5 - (side - count) / 2
+    return np.histogram2d(y.ravel(), x.ravel(), [edges, edges])[0]
+
+
+def _lenslets(rng: np.random.Generator, side: int, width: float) -> np.ndarray:
+    image = np.zeros((side, side))
+    middles = rng.uniform(-width, width, (int(rng.integers(8, 60)), 2)) / 2 + side / 2
+    rows, columns = np.clip(middles, 0, side - 1).astype(int).T
+    np.add.at(image, (rows, columns), rng.uniform(0.5, 1, len(rows)))
+    return ndimage.gaussian_filter(image, rng.uniform(0.4, 1.5))
+
 
 # Sides of the sensor in those of the field, and captures: half of the cameras are of the first.
 _LAYOUTS = ((2, 1), (1, 1), (2, 1), (2, 4))

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.denoiser.crops import draw_crops, loss
-from thincam_jax.learn.denoiser.network import Denoiser, network_card
+from thincam_jax.learn.denoiser.network import Denoiser, DenoisingUNet, network_card
 from thincam_jax.learn.denoiser.pictures import TILE, Pictures
 from thincam_jax.learn.denoiser.reconstructions import (
     draw_cameras,
+    draw_crops,
     draw_reconstructions,
+    loss,
     reconstruction_loss,
 )
-from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.refocusing.sources import Entry, as_json
 from thincam_jax.learn.training import (
     Task,

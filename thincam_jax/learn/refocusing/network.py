@@ -23,10 +23,9 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.module import Module
+from thincam_jax._core.module import Key, Module, random_key
 from thincam_jax._core.quantity import FieldError, check_fields, whole
-from thincam_jax._core.random import Key, random_key
-from thincam_jax._core.text import of_error
+from thincam_jax._core.table import of_error
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     network_description,
@@ -35,9 +34,8 @@ from thincam_jax.learn.checkpoint import (
 )
 from thincam_jax.learn.refocusing import store
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
-from thincam_jax.learn.refocusing.lens_blur import lens_blur
-from thincam_jax.learn.refocusing.linear import LinearStep
-from thincam_jax.learn.refocusing.planes import Planes
+from thincam_jax.learn.refocusing.planes import LinearStep, Planes
+from thincam_jax.learn.refocusing.scenes import lens_blur
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from thincam_jax._core.grids import Grid, centred_frequencies, centred_indices
 from thincam_jax._core.precision import as_complex, turn_phasor
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import (
@@ -22,8 +23,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     propagate,
     spherical_wave,
 )
-from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum
 
 # Rows and columns that are looked at. All sizes have this many, so that nothing recompiles.
 COUNT = 256

@@ -21,14 +21,13 @@ from thincam_jax.lensless.accuracy.lines import (
     chosen,
     fine_fields,
 )
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
-from thincam_jax.lensless.propagation.separable import pixel_nodes
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
 from thincam_jax.lensless.psf import closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.

@@ -37,6 +37,7 @@ from thincam_jax._core.precision import (
 )
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.accuracy.probe import spread
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
 from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import (
@@ -47,10 +48,9 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     planes,
     propagate,
 )
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.propagation.radial import PROFILE_ERROR, profile_samples, radial
-from thincam_jax.lensless.propagation.separable_field import separable_image
-from thincam_jax.lensless.sampling import samples_needed
+from thincam_jax.lensless.propagation.separable import separable_image
+from thincam_jax.lensless.resolve import samples_needed
 
 # Of the mask's middle, along each axis; the window of a PSF, and one that cuts nothing of note.
 _LINES, _PADDED = 12, (PADDING, 4 * PADDING)

@@ -3,7 +3,7 @@
 import abc
 import functools
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeGuard
 
 import equinox as eqx
 import jax
@@ -224,6 +224,16 @@ def _count(structure: Any, leaves: tuple) -> TermCount:
     cells = max(axis.values.shape[1] for axis in (terms.rows, terms.columns))
     counts = terms.coefficients.shape[0], shadow.coefficients.shape[0]
     return TermCount(*counts, cells, terms.columns.curvatures is not None)
+
+
+# Terms of a mask up to which `separable` squares them one by one, in one dimension; of more, it
+# adds up the field first.
+_MOST_TERMS = 128
+
+
+def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:
+    """Whether the mask is a sum of so few products that its PSF is a short sum of them, too."""
+    return isinstance(mask, AbstractFactoredMask) and term_count(mask).terms <= _MOST_TERMS
 
 
 def other_models(mask: AbstractMask) -> str:

@@ -13,9 +13,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax._core.module import Key, random_key
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import quantity
-from thincam_jax._core.random import Key, random_key
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AxisFactors,
@@ -23,7 +23,7 @@ from thincam_jax.lensless.masks.base import (
     Transmittance,
     open_parts,
 )
-from thincam_jax.lensless.masks.cells import cell_edges
+from thincam_jax.lensless.masks.redundant_arrays import cell_edges
 
 _WIDEST = 1000.0  # mm, of a mask from an image
 

@@ -10,25 +10,23 @@ from thincam_jax._core.precision import itemsize_of
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
-from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.field import points_needed, tangents_of
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.method import (
-    CLOSED,
-    Model,
-    PsfMethod,
-    has_few_terms,
-    models_of,
-    psf_method,
-)
+from thincam_jax.lensless.masks.base import has_few_terms
+from thincam_jax.lensless.method import CLOSED, Model, PsfMethod, models_of, psf_method
 from thincam_jax.lensless.plan.transfer import (
     SampledProbe,
     TransferProbe,
     image_spectrum,
     sample_frequencies,
 )
-from thincam_jax.lensless.sampling import samples_needed
+from thincam_jax.lensless.resolve import (
+    Cost,
+    convolution_cost,
+    held_in_single,
+    psf_cost,
+    samples_needed,
+)
 
 # Predictions come from some hundred random frequencies: what they are multiplied with.
 _MARGIN = 1.5

@@ -17,10 +17,9 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.precision import allow, cast, product
 from thincam_jax.lensless.accuracy.lines import SparseGrid
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
 
 # Rings of frequencies, and frequencies in each.

@@ -8,9 +8,9 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_shape
 from thincam_jax._core.precision import as_complex, squared_modulus, turn_phasor
+from thincam_jax.lensless.camera import ChiefRay, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation.path import ChiefRay, LightPath
 
 PADDING = 2.0  # the window of a PSF over mask and sensor side by side
 

@@ -6,6 +6,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, product
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -13,8 +14,7 @@ from thincam_jax.lensless.masks.base import (
     other_models,
 )
 from thincam_jax.lensless.propagation.chirp import chirp_average
-from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.propagation.separable import SeparableSum
 
 
 def geometric(

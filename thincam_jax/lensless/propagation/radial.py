@@ -12,12 +12,12 @@ from numpy.polynomial.hermite import hermgauss
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, flat_root, phasor, squared_modulus
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, other_models
 from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod
 from thincam_jax.lensless.propagation.chirp import edge_wave
-from thincam_jax.lensless.propagation.lattice import pixel_mean
-from thincam_jax.lensless.propagation.path import LightPath
+from thincam_jax.lensless.propagation.separable import pixel_mean
 
 # From this v on the rim's waves are those of its nearest and its farthest point.
 _TWO_WAVES = 8.0

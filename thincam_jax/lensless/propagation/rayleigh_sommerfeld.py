@@ -6,10 +6,10 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import squared_modulus, turn_phasor
+from thincam_jax.lensless.camera import ChiefRay, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes, within
-from thincam_jax.lensless.propagation.path import ChiefRay, LightPath
 
 # Sensor samples done together: bounds the memory to this many copies of the mask plane.
 _BATCH = 64

@@ -1,21 +1,79 @@
-r"""`separable`: the exact Fresnel field of a mask of few separable terms, in closed form."""
+"""`separable`: the exact Fresnel field of a mask of few separable terms, in closed form."""
 
 import math
+from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, DTypeLike, Float
 from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import Precision, as_complex, product
-from thincam_jax.lensless.masks.base import AbstractMask, AxisFactors, pairs, require_factored
+from thincam_jax._core.precision import Precision, as_complex, product, turn_phasor
+from thincam_jax.lensless.camera import LightPath
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AbstractMask,
+    AxisFactors,
+    MaskTerms,
+    pairs,
+    require_factored,
+)
 from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
-from thincam_jax.lensless.propagation.path import LightPath
-from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+
+
+class SeparableSum(eqx.Module):
+    """The image Σ_m Re{ Y_m(y) X_m(x) }.
+
+    A PSF of a square Fresnel zone aperture has this form with a handful of terms, because |U|² of
+    a sum of separable fields is again one. Image, pixel average and OTF then cost one-dimensional
+    work and one real matrix product, in place of two-dimensional transforms.
+
+    - `rows`: Y_m on the rows, with all constant factors.
+    - `columns`: X_m on the columns.
+    - `grid`: where the samples lie.
+    """
+
+    rows: Complex[Array, "term y"]
+    columns: Complex[Array, "term x"]
+    grid: Grid
+
+    def image(self) -> Float[Array, "y x"]:
+        """The image on the grid."""
+        rows, columns = self.real_factors()
+        return product(rows.T, columns)
+
+    def transform(self) -> Complex[Array, "v u"]:
+        """Fourier transform ∬ h e^{−2πj(ux+vy)} dx dy on the grid's centred frequencies, mm².
+
+        The integral over the sampled area, as the sum of the samples times pitch².
+        """
+        rows, columns = (_centred_dft(factor) for factor in self.real_factors())
+        return product(rows.T, columns) * as_complex(self.grid.pitch**2)
+
+    def real_factors(self) -> tuple[Float[Array, "factor y"], Float[Array, "factor x"]]:
+        """Real Y_f and X_f with h = Σ_f Y_f(y) X_f(x), twice as many as there are terms."""
+        # Re{YX} = Re Y Re X − Im Y Im X: one real product in place of a complex one.
+        rows = jnp.concatenate([self.rows.real, -self.rows.imag])
+        return rows, jnp.concatenate([self.columns.real, self.columns.imag])
+
+
+def _centred_dft(samples: Float[Array, "factor n"]) -> Complex[Array, "factor n"]:
+    """Σ_i f_i e^{−2πj u (i−(n−1)/2)}, zero frequency at n//2."""
+    n = samples.shape[-1]
+    spectrum = jnp.fft.fftshift(jnp.fft.fft(samples, axis=-1), axes=-1)
+    return spectrum * centre_phase(n, samples.dtype)
+
+
+def centre_phase(count: int, dtype: DTypeLike) -> Complex[Array, " count"]:
+    """e^{2πj u (n−1)/2} on the centred DFT frequencies: moves the origin to the grid's centre."""
+    turns = (jnp.arange(count, dtype=dtype) - count // 2) * ((count - 1) / (2 * count))
+    return turn_phasor(turns)
+
 
 # Nodes fewer than `PIXEL_NODES`, and the fringes a pixel up to which their averages are exact to
 # 1e-7 and 1e-13.
@@ -169,3 +227,87 @@ def separable(
         # One axis a core: a quarter faster.
         rows, columns = products(down, along_y, y), products(across, along_x, x)
     return SeparableSum(weights[:, None] * rows, columns, grid)
+
+
+def pixel_mean(
+    value: Callable[[Float[Array, "2"]], Float[Array, "y x"]], count: int, dark: Float[Array, "y x"]
+) -> Float[Array, "y x"]:
+    """Mean over `count` points of each pixel of the image at a point; `dark` is an image of 0."""
+    places = jnp.asarray(lattice(count), dark.dtype)
+    total, _ = jax.lax.scan(lambda total, place: (total + value(place), None), dark, places)
+    return total / count
+
+
+def lattice(count: int) -> Float[np.ndarray, "point 2"]:
+    """Points (u, frac(g·u)), u = (i + ½)/count, of a rank-1 lattice about the pixel's centre.
+
+    g is odd, has no divisor in common with the count and is next to count/golden ratio or its
+    complement: of Fibonacci numbers, the best lattice (Niederreiter, CBMS-NSF 63 (1992), ch. 5).
+    Odd, so that the points turned by 180° are the points.
+    """
+    golden = (math.sqrt(5) - 1) / 2 * count
+    odd = [g for g in range(1, max(count, 2), 2) if math.gcd(g, count) == 1]
+    generator = min(odd, key=lambda g: min(abs(g - golden), abs(count - g - golden)))
+    first = (np.arange(count) + 0.5) / count
+    return np.stack([first, first * generator % 1], axis=-1) - 0.5
+
+
+def separable_image(
+    mask: AbstractFactoredMask, grid: Grid, path: LightPath, *, nodes: int | None
+) -> Float[Array, "y x"]:
+    r"""PSF of a mask of K terms, |Σ_k c_k A_k(x) B_k(y)|² summed before it is squared.
+
+    The same field as `separable`'s, at 8K operations a pixel in place of the 2K² of its products.
+    A pixel's average is the mean over `nodes` points of it, None for its centre. They are a rank-1
+    lattice: as many different rows and columns as there are points, since the waves of the edges
+    along one axis are fine along the other only. It is off by some 0.35/nodes of the PSF, where
+    pixels hold many fringes, against 1/√nodes of a square of as many Gauss nodes.
+    """
+    terms = mask.terms(path.wavelength)
+    y, x = path.on_mask(grid, mask.centre)
+    along_y, along_x = path.along_axes(mask.centre)
+    pitch = grid.pitch / path.magnification
+    cells = None if terms.rows.curvatures is not None else _cells(terms)
+
+    @jax.checkpoint
+    def irradiance(place: Float[Array, "2"]) -> Float[Array, "y x"]:
+        down, across = y + place[0] * pitch, x + place[1] * pitch
+        if cells is None:
+            rows = terms.coefficients[:, None] * axis_fields(terms.rows, along_y, down)
+            columns = axis_fields(terms.columns, along_x, across)
+        else:
+            rows = _cell_fields(terms.rows.edges, along_y, down)
+            columns = _cell_fields(terms.columns.edges, along_x, across)
+            if len(rows) <= len(columns):
+                columns = product(cells, columns)
+            else:
+                rows = product(cells.T, rows)
+        return _square_of_product(rows, columns)
+
+    if nodes is None:
+        return irradiance(jnp.zeros(2, x.dtype))
+    return pixel_mean(irradiance, nodes, jnp.zeros(grid.shape, x.dtype))
+
+
+def _cells(terms: MaskTerms) -> Complex[Array, "row column"]:
+    """The mask's transmittance in each pair of cells."""
+    return product(terms.rows.values.T * terms.coefficients, terms.columns.values)
+
+
+def _cell_fields(
+    edges: Float[Array, " edge"], path: LightPath, x: Float[Array, " n"]
+) -> Complex[Array, "cell n"]:
+    """Field of each open cell alone, along one axis; see `axis_fields`."""
+    lit, waves = cell_shadows(edges, path, x)
+    field = lit * (1 + 1j) + waves[:-1] - waves[1:]
+    return field * jnp.asarray(np.sqrt(0.5), field.dtype)
+
+
+def _square_of_product(
+    rows: Complex[Array, "k y"], columns: Complex[Array, "k x"]
+) -> Float[Array, "y x"]:
+    """|rowsᵀ columns|² by three real products, which processors do faster than complex ones."""
+    first = product(rows.real.T, columns.real)
+    second = product(rows.imag.T, columns.imag)
+    both = product((rows.real + rows.imag).T, columns.real + columns.imag)
+    return (first - second) ** 2 + (both - first - second) ** 2

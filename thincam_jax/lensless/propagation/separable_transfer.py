@@ -23,9 +23,9 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex, phasor, product
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.path import LightPath
 
 
 class TransferFactors(eqx.Module):

@@ -13,9 +13,9 @@ from numpy.polynomial.legendre import leggauss
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product, squared_modulus
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.path import LightPath
 
 # What the axes may share of an order's curvature, 1 where it focuses along a line.
 _MOST_SHARED = 0.25

@@ -17,9 +17,8 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
 from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantities, unchecked
-from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.propagation.path import LightPath
 from thincam_jax.measured.calibration.coarse import (
     covariance_by_differences,
     full_image,

@@ -17,6 +17,7 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum, central_blocks, centred_indices
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow
+from thincam_jax._core.progress import watched
 from thincam_jax.measured.calibration.problem import Status, verdict
 from thincam_jax.measured.raw import image_with_contrast
 
@@ -52,6 +53,7 @@ class Registration(Module):
 
 
 @checked
+@watched("registering captures")
 def estimate_registration(
     capture: Numbers,
     reference: Numbers,

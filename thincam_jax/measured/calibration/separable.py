@@ -22,6 +22,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
+from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadamard
 
@@ -51,6 +52,7 @@ class SeparableFit(Module):
 
 
 @checked
+@watched("calibrating the camera")
 def calibrate_separable(
     rows: Num[np.ndarray, "m y x"], columns: Num[np.ndarray, "n y x"], *, shown: Shown = "stripes"
 ) -> SeparableFit:
@@ -103,6 +105,7 @@ def calibrate_separable(
 
 
 @checked
+@watched("fitting the camera")
 def fit_separable(
     images: Float[Array, "j m n"],
     captures: Float[Array, "j y x"],

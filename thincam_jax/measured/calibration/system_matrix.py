@@ -22,6 +22,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.capture_store import VERSION, opened, stored_array, zarr_library
 from thincam_jax._core.files import writing
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration.captures import CaptureStoreError, HadamardCaptures
 from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadamard
@@ -45,6 +46,7 @@ def matrix_blocks(captures: HadamardCaptures) -> Iterator[Block]:
 
 
 @checked
+@watched("recovering the matrix")
 def recover_matrix(captures: HadamardCaptures) -> Matrix:
     """H as an operator, in float32, for `Recording`: 3.2 GB for 64² cells and 440² pixels.
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.progress import watched
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
@@ -49,6 +50,7 @@ class RefocusSweep(eqx.Module):
 
 
 @checked
+@watched("refocusing")
 def refocus_sweep(
     recording: Recording,
     distances: Numbers | Sequence[float | int],

@@ -20,6 +20,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
+from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantities, unchecked
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.imaging.operators.masked import Scaled
@@ -235,6 +236,7 @@ class _Problem(eqx.Module):
 
 
 @checked
+@watched("fitting the screen")
 def fit_screen(
     measured: Matrix | GhostPositions,
     camera: SeeThroughCamera,

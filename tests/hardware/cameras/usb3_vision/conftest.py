@@ -7,7 +7,7 @@ import pytest
 
 from thincam_jax.hardware import CameraSettings
 from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
-from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.devices import Faults
 from thincam_jax.hardware.virtual.rig import bits_of
 from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 

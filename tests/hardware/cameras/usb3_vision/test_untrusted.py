@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from helpers import ROOT
+from thincam_jax.hardware.base import ProtocolError
 from thincam_jax.hardware.cameras.usb3_vision import features, gencp, stream
 from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
-from thincam_jax.hardware.errors import ProtocolError
 from thincam_jax.hardware.virtual import usb3_vision
 from thincam_jax.hardware.virtual.usb3_vision import SIRM
 

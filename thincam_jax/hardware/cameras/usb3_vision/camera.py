@@ -8,14 +8,20 @@ from typing import Any
 import usb.core
 import usb.util
 
-from thincam_jax.hardware.base import CameraSettings, Connected, Frame, Identity
+from thincam_jax.hardware.base import (
+    CameraSettings,
+    Connected,
+    Frame,
+    HardwareError,
+    Identity,
+    Timeout,
+)
 from thincam_jax.hardware.cameras.features import FeatureCamera, read, trigger_by_software
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.features import GenApiFeatures, fetch_xml
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
 from thincam_jax.hardware.cameras.usb3_vision.link import CameraMemory, UsbLink, cameras_there
 from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS, FrameReader, unpack
-from thincam_jax.hardware.errors import HardwareError, Timeout
 
 # Frames without chunk data, at any trigger.
 _PLAIN = {"ChunkModeActive": False, "AcquisitionFrameRateEnable": False, "ExposureMode": "Timed"}

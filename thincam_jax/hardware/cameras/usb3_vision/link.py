@@ -15,9 +15,7 @@ from typing import Any
 import usb.core
 import usb.util
 
-from thincam_jax.hardware.cameras.usb3_vision import gencp
-from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm, Command, Sbrm, Status
-from thincam_jax.hardware.errors import (
+from thincam_jax.hardware.base import (
     Busy,
     Disconnected,
     HardwareError,
@@ -27,6 +25,8 @@ from thincam_jax.hardware.errors import (
     ProtocolError,
     Timeout,
 )
+from thincam_jax.hardware.cameras.usb3_vision import gencp
+from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm, Command, Sbrm, Status
 from thincam_jax.hardware.holder import holder
 
 # Class, subclass and protocol of the two interfaces that every USB3 Vision camera has.

@@ -16,10 +16,9 @@ from time import monotonic
 
 import numpy as np
 
-from thincam_jax.hardware.base import Region
+from thincam_jax.hardware.base import IncompleteFrame, Region, Timeout
 from thincam_jax.hardware.cameras.usb3_vision.gencp import SIRM_LENGTH, Sirm
 from thincam_jax.hardware.cameras.usb3_vision.link import CameraMemory, UsbLink
-from thincam_jax.hardware.errors import IncompleteFrame, Timeout
 
 LEADER = struct.Struct("<IHHQHHQIIIIIHH")
 TRAILER = struct.Struct("<IHHQHHQ")
