@@ -10,6 +10,7 @@ import functools
 import json
 import logging
 import os
+import re
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,7 @@ from thincam_jax.commands import cli
 from thincam_jax.imaging.operators import CropConvolution, Separable
 from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.reconstruction.other_psf import MIRRORED
 
 SHAPE, SIDE = (96, 128), 64
 COUNT = int(os.environ.get("THINCAM_CASES", "200"))
@@ -151,7 +153,7 @@ def _edges(image):
 
 
 def command(folder, psf, capture, *options):
-    """Score-able image and what was said, of `thincam reconstruct`."""
+    """Score-able image, names of what was said, and the words, of `thincam reconstruct`."""
     out = folder / "image.npy"
     words = "reconstruct", "--psf", psf, "--capture", capture, "--out", out, "--field", "sensor"
     with warnings.catch_warnings():
@@ -159,13 +161,37 @@ def command(folder, psf, capture, *options):
         result = CliRunner().invoke(cli.app, [str(word) for word in (*words, *options)])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     if result.exit_code:
-        return None, [result.stderr.strip().splitlines()[-1]]
+        return None, [result.stderr.strip().splitlines()[-1]], ""
     record = json.loads(out.with_suffix(".json").read_text("utf-8"))
     said = [one["name"] for one in record["examination"]]
     warned = [line for line in result.stderr.splitlines() if "warning" in line]
     said += ["no dark corner"] if any("is dark" in line for line in warned) else []
     said += ["explains nothing"] if "explains almost nothing" in result.stderr else []
-    return np.atleast_3d(np.load(out)).mean(axis=2), said
+    advice = " ".join(one["advice"] for one in record["examination"])
+    return np.atleast_3d(np.load(out)).mean(axis=2), said, advice
+
+
+def advised(folder, psf, capture, found, level):
+    """The image of `found` once every advice is followed; the black level is one of a dark frame.
+
+    Of two patterns the first is taken: the score is that of grey.
+    """
+    options, counts = [], tifffile.imread(psf)
+    for _ in range(4):
+        image, said, advice = found
+        more, pattern = [], re.search(r"give --bayer (\w+)", advice)
+        if pattern and "--bayer" not in options:
+            more += ["--bayer", pattern[1]]
+        if "no dark corner" in said and "--background" not in options:
+            more += ["--background", level]
+        turned = [axes for name, axes in MIRRORED.items() if name in advice]
+        if not (more or turned):
+            break
+        counts = np.flip(counts, turned[0]) if turned else counts
+        tifffile.imwrite(folder / "advised.tif", np.ascontiguousarray(counts))
+        options += more
+        found = command(folder, folder / "advised.tif", capture, *options)
+    return image
 
 
 def by_files(folder: Path, number):
@@ -186,7 +212,8 @@ def by_files(folder: Path, number):
     right = [*known, "--background", level, *(["--bayer", dirt.pattern] if dirt.pattern else [])]
     grid = [right, [*right, "--saturation", 0.999, "--dead", folder / "dead.tif"]]
     clean = [] if faults else [*known, "--background", level]
-    made, said = command(folder, paths["psf"], paths["capture"], *clean)
+    found = command(folder, paths["psf"], paths["capture"], *clean)
+    made, said, _ = found
     others = [command(folder, upright, paths["capture"], *options)[0] for options in grid]
     truth, border = image.mean(axis=0), np.concatenate([p.ravel() for p in _edges(cut(psf))])
     if np.ptp(border) > 0.1 * psf.max():  # it is cut, so that to say so is right
@@ -198,7 +225,10 @@ def by_files(folder: Path, number):
         first = [(n - SIDE) // 2 for n in found.shape]
         return score(found[first[0] : first[0] + SIDE, first[1] : first[1] + SIDE], truth)
 
-    return camera, faults, quality(made), max(quality(one) for one in [made, *others]), said
+    scores = quality(made), max(quality(one) for one in [made, *others])
+    if scores[1] - scores[0] > 1:
+        scores += (quality(advised(folder, paths["psf"], paths["capture"], found, level)),)
+    return camera, faults, scores, said
 
 
 def by_recording(number, caplog):
@@ -226,29 +256,32 @@ def by_recording(number, caplog):
     said = [one.getMessage() for one in caplog.records]
     best = tc.reconstruct(tc.Recording([counts], operator, valid=[valid], background=level))
     scores = [score(np.asarray(one.image), truth) for one in (found, best)]
-    return camera, faults, scores[0], max(scores), said
+    return camera, faults, (scores[0], max(scores)), said
 
 
 def test_dirty_captures(tmp_path, capsys, caplog):
     """Nothing is 3 dB below what was possible without a word; clean captures raise no alarm."""
     if not PHOTOGRAPHS.exists():
         pytest.skip(f"needs photographs in {PHOTOGRAPHS}")
-    lost, silent, alarms, clean = [], [], [], 0
+    lost, after, silent, alarms, clean = [], [], [], [], 0
     for number in range(COUNT):
         camera, _, _ = case(number)
         one = by_files(tmp_path, number) if camera in PSFS else by_recording(number, caplog)
-        camera, faults, made, best, said = one
-        row = f"| {number} | {camera} | {', '.join(faults) or 'clean'} | {made:.1f} | {best:.1f} "
+        camera, faults, (made, best, *followed), said = one
+        row = f"| {number} | {camera} | {', '.join(faults) or 'clean'} | {made:.1f} "
+        row += f"| {', '.join(f'{one:.1f}' for one in followed)} | {best:.1f} "
         with capsys.disabled():
             print(f"{row}| {'; '.join(said)} |", flush=True)
         clean += not faults
         alarms += [number] * bool(set(said) - {"(cut)"} and not faults)
         if faults:
             lost.append(best - made)
+            after.append(best - max(made, *followed, -np.inf))
             silent += [(number, best - made)] * (not set(said) - {"(cut)"} and best - made > 1)
     lost = np.array(lost)
     with capsys.disabled():
         print(f"{lost.size} dirty: {(lost <= 1).mean():.0%} within 1 dB, {np.median(lost):.2f} dB")
+        print(f"{(np.array(after) <= 1).mean():.0%} within 1 dB after following the advice")
         print(f"silent beyond 1 dB: {silent}; alarms on {clean} clean: {alarms}")
     assert all(difference <= 3 for _, difference in silent)
     assert len(alarms) <= 0.02 * clean

@@ -1,9 +1,5 @@
 """The names of `thincam_jax`; `__init__.py` reads them from here."""
 
-from thincam_jax.lensless.masks.pinhole import LensletArray as LensletArray
-from thincam_jax.lensless.masks.redundant_arrays import SeparableMask as SeparableMask
-from thincam_jax.plot.page import explore as explore
-
 from . import design as design
 from . import hardware as hardware
 from . import imaging as imaging
@@ -33,11 +29,13 @@ from .lensless.exposures import Exposures as Exposures
 from .lensless.field import field_operator as field_operator
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from .lensless.masks.phase import PhaseMask as PhaseMask
+from .lensless.masks.pinhole import LensletArray as LensletArray
 from .lensless.masks.pinhole import Pinhole as Pinhole
 from .lensless.masks.pinhole import RadialMask as RadialMask
 from .lensless.masks.redundant_arrays import (
     ModifiedUniformlyRedundantArray as ModifiedUniformlyRedundantArray,
 )
+from .lensless.masks.redundant_arrays import SeparableMask as SeparableMask
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import PsfMethod as PsfMethod
@@ -48,6 +46,7 @@ from .lensless.psf import psf as psf
 from .lensless.separable_operator import separable_operator as separable_operator
 from .measured.calibration.psf_fit import fit_psf as fit_psf
 from .measured.calibration.separable import fit_separable as fit_separable
+from .plot.page import explore as explore
 from .reconstruction.fringe_filter import FringeScanning as FringeScanning
 from .reconstruction.imaging_model import Cameras as Cameras
 from .reconstruction.imaging_model import Psfs as Psfs

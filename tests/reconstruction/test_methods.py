@@ -10,9 +10,9 @@ from reconstruction import extremes, rig, scenes
 import thincam_jax as tc
 from helpers import shared_data
 from thincam_jax.imaging.operators import Matrix
+from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.imaging.operators.low_rank import low_rank_psf
 from thincam_jax.reconstruction import TotalVariation
-from thincam_jax.reconstruction.assembly import centred_crop
 from thincam_jax.reconstruction.problem import residuals
 from thincam_jax.reconstruction.regularisers import Sparsity, Wavelet
 from thincam_jax.reconstruction.synthesis import separate

@@ -11,7 +11,7 @@ from reconstruction import extremes, rig, scenes
 
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2
-from thincam_jax.reconstruction.assembly import centred_crop
+from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.reconstruction.poisson import (
     LINKS,
     Counts,

@@ -8,7 +8,6 @@ is: 5 numbers an iteration are learned, so that some tens of pairs suffice.
 
 import functools
 import math
-import time
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -19,8 +18,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.reconstruction.admm import AbstractSplitting, Penalties, State, admm_map
-from thincam_jax.reconstruction.iterate import Outcome, Progress, Status
-from thincam_jax.reconstruction.problem import InverseProblem, objective, uniform_image
+from thincam_jax.reconstruction.iterate import Status
+from thincam_jax.reconstruction.problem import InverseProblem, uniform_image
 from thincam_jax.reconstruction.splittings import splitting_of
 
 
@@ -167,23 +166,6 @@ def train(
     return UnrolledTraining(best, tuple(losses), "iterations_exhausted")
 
 
-def solve_unrolled(problem: InverseProblem, model: UnrolledAdmm) -> Outcome:
-    """The image of a problem by a (trained) model.
-
-    It is the last one, whatever the problem's objective makes of it; the history holds that
-    objective after each iteration. The status is "iterations_exhausted", as all are always done, or
-    "non_finite".
-    """
-    began = time.perf_counter()
-    values, image = _followed(model, problem)
-    history = tuple(
-        Progress(n, float(v), math.nan, math.nan) for n, v in enumerate(jax.device_get(values))
-    )
-    finite = bool(jnp.isfinite(image).all())
-    status: Status = "iterations_exhausted" if finite else "non_finite"
-    return Outcome(image, status, history, len(history) - 1, time.perf_counter() - began)
-
-
 @jax.jit
 def training_loss(
     model: UnrolledAdmm, problem: InverseProblem, images: Float[Array, "pair channel plane y x"]
@@ -207,14 +189,6 @@ def _descend(model: UnrolledAdmm, state, rate, problem: InverseProblem, images, 
 
     model, state, _, (value, _) = adam_step(loss, model, state, rate, adam_method())
     return model, state, value
-
-
-@jax.jit
-def _followed(model: UnrolledAdmm, problem: InverseProblem):
-    """The objective before and after each iteration, summed over a batch, and the last image."""
-    images = model.images(problem)
-    values = [jnp.sum(objective(problem, f)) for f in (uniform_image(problem), *images)]
-    return jnp.stack(values), images[-1]
 
 
 def _check_pairs(problem: InverseProblem, images: Array, batch: int) -> None:

@@ -35,7 +35,7 @@ def harmonic_otf(
 
     exact for K above the mask's highest difference of orders plus m; so many are computed. Fewer
     captures fold the harmonics m ± K into it, with responses that are known as well
-    (`thincam_jax.reconstruction.harmonics`).
+    (`thincam_jax.reconstruction.synthesis.harmonics`).
 
     The phase of the camera's mask is not used. Other arguments and errors as for `otf`; TypeError
     for masks that have no phase, ValueError for a harmonic below 0.

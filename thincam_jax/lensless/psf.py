@@ -26,6 +26,7 @@ from thincam_jax._core.precision import (
     squared_modulus,
     turn_phasor,
 )
+from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
 from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod
@@ -108,7 +109,24 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
-    return _computed(_psf, camera, path, method)
+    grid, wide = camera.sensor.grid, _in_steps(camera, path, method)
+    if wide is grid:
+        return _computed(_psf, camera, path, method)
+    h = _computed(_psf, camera.on_grid(wide), path, method)
+    return cut(h, middle_corner(grid.shape, wide.shape), grid.shape)
+
+
+def _in_steps(camera: LenslessCamera, path: LightPath, method: PsfMethod) -> Grid:
+    """More samples of a closed form, up to a step, within which sizes share a program.
+
+    It takes a second to compile, and hundredths to run.
+    """
+    grid = camera.sensor.grid
+    closed = method.model == "separable" and not path.skew and has_few_terms(camera.mask)
+    if not closed or checks.holds_traced(camera.mask, grid, path):
+        return grid
+    rows, columns = (n + (-n - n % 2) % 2 ** max(1, n.bit_length() - 2) for n in grid.shape)
+    return grid.with_shape((rows, columns))
 
 
 def spectral_psf(
@@ -121,7 +139,11 @@ def spectral_psf(
 ) -> Float[Array, "y x"]:
     """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
     own = camera.on_grid(grid)
-    parts = (weight * psf_about_ray(own, w, object_distance, at, method) for w, weight in light)
+    parts = []
+    for wavelength, weight in light:
+        h = psf_about_ray(own, wavelength, object_distance, at, method)
+        is_whole = not checks.is_traced(weight) and float(weight) == 1
+        parts.append(h if is_whole else weight * h)  # of one colour nothing to compile
     return functools.reduce(operator.add, parts)
 
 

@@ -13,13 +13,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import is_traced
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import AccuracyWarning
-from thincam_jax.imaging.operators.crop_convolution import (
-    CropConvolution,
-    cut,
-    kernel_shape,
-    plane_mean,
-    window_shape,
-)
+from thincam_jax.imaging.operators.crop_convolution import CropConvolution, plane_mean, window_shape
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one
 from thincam_jax.reconstruction.uniform_light import high_passed, window_length
 
@@ -126,12 +120,7 @@ def convolution_problem(
     """The problem of convolutions on one window."""
     dtype = channels[0].capture.dtype
     windows = [
-        window_shape(
-            c.capture.shape[-2:],
-            field_shape,
-            _kernel_extent(c.kernel, c.capture.shape[-2:], field_shape),
-        )
-        for c in channels
+        window_shape(c.capture.shape[-2:], field_shape, c.kernel.shape[-2:]) for c in channels
     ]
     window = (max(w[0] for w in windows), max(w[1] for w in windows))
     # Captures, kernels and a field, each with its transform, at the least.
@@ -157,21 +146,6 @@ def convolution_problem(
     ]
     warn_of_equal_planes(operators, weights)
     return InverseProblem(operators, [c.capture for c in channels], weights=weights, **settings)
-
-
-def centred_crop(
-    image: Float[Array, "*batch y x"], shape: Sequence[int]
-) -> Float[Array, "*batch v u"]:
-    """The central part of an image, of this shape."""
-    corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
-    return cut(image, corner, shape)
-
-
-def _kernel_extent(kernel, sensor, field_shape) -> tuple[int, int]:
-    """Kernel extent that reaches the sensor from the field."""
-    most = kernel_shape(sensor, field_shape)
-    rows, columns = (min(k, m) for k, m in zip(kernel.shape[-2:], most, strict=True))
-    return rows, columns
 
 
 def fitting_field(

@@ -236,7 +236,7 @@ class AbstractRegularised(AbstractIterativeSolver):
             problem = without_smooth_misfit(problem)
             image = image if upright is None else image * unit
         if self.nonnegative:  # it is returned if no iterate is better
-            image = jnp.maximum(image, 0)
+            image = jnp.asarray(np.maximum(np.asarray(image), 0))
         if rule:
             try:
                 found = find_tau(rule, problem, image)

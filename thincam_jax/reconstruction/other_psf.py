@@ -18,7 +18,7 @@ from thincam_jax.reconstruction.regularisers import Image
 
 TURN = "turn the PSF or the captures"
 RESIZE = "refine it (thincam calibrate check --refine), or the cameras' distance"
-_MIRRORED = {"upside down": (-2,), "mirrored left to right": (-1,), "turned by 180°": (-2, -1)}
+MIRRORED = {"upside down": (-2,), "mirrored left to right": (-1,), "turned by 180°": (-2, -1)}
 _SCALES = (0.94, 0.97, 1.03, 1.06)
 _COARSER = 2  # times twice as large
 _BETTER = 0.85  # of the objective
@@ -51,7 +51,7 @@ def better_psf(
         ]
         return solve(eqx.tree_at(lambda p: p.operators, problem, tuple(changed)), image)
 
-    found = {f"is {name}; {TURN}": objective(_mirror(axes)) for name, axes in _MIRRORED.items()}
+    found = {f"is {name}; {TURN}": objective(_mirror(axes)) for name, axes in MIRRORED.items()}
     if of_any_size:
         found |= {f"has {s:g} times the size; {RESIZE}": objective(_resize(s)) for s in _SCALES}
     best = min(found, key=lambda name: found[name])

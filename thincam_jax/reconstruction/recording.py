@@ -17,9 +17,10 @@ from thincam_jax._core.grids import same_parity
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import AbstractOperator, Masked, Stacked
 from thincam_jax.imaging.operators.base import is_shape, shapes_of
+from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.reconstruction.assembly import centred_crop, convolution_problem, fitting_field
+from thincam_jax.reconstruction.assembly import convolution_problem, fitting_field
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.noise import (
@@ -214,9 +215,8 @@ class Recording(Module):
     def shaped(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "..."]:
         """The image of a problem, upright and with the axes of the captures."""
         if isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None:
-            image = centred_crop(
-                image, self.captures[0].shape[-2:]
-            )  # the part in front of the sensor
+            # The part in front of the sensor.
+            image = centred_crop(image, self.captures[0].shape[-2:])
         planes = image.shape[-3]
         batch = image.shape[:-3] if self._has_channel() else image.shape[:-4]
         image = image.reshape(*batch, *((planes,) if planes > 1 else ()), *image.shape[-2:])

@@ -13,12 +13,11 @@ from jaxtyping import Float
 from thincam_jax._core.arguments import any_rank
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.imaging.operators.crop_convolution import window_shape
+from thincam_jax.imaging.operators.crop_convolution import centred_crop, window_shape
 from thincam_jax.lensless.psf import psf
 from thincam_jax.measured import MeasurementError, Raw
 from thincam_jax.measured.preparation import Prepared
 from thincam_jax.reconstruction import AbstractSolver, InverseProblem
-from thincam_jax.reconstruction.assembly import centred_crop
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Callback, Progress
 from thincam_jax.reconstruction.methods import AbstractRegularised, reconstruct

@@ -229,6 +229,14 @@ def _spectrum(kernel, pitch, window, shift):
     return jnp.fft.rfft2(placed)
 
 
+def centred_crop(
+    image: Float[Array, "*batch y x"], shape: Sequence[int]
+) -> Float[Array, "*batch v u"]:
+    """The central part of an image, of this shape."""
+    corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
+    return cut(image, corner, shape)
+
+
 def kernel_shape(sensor_shape: tuple[int, int], field_shape: tuple[int, int]) -> tuple[int, int]:
     """Samples of all differences between a sensor pixel and a field sample."""
     rows, columns = (s + f - 1 for s, f in zip(sensor_shape, field_shape, strict=True))
@@ -241,10 +249,11 @@ def window_shape(
     """The fastest window in which a kernel of this shape does not wrap onto the sensor.
 
     A difference r − r′ outside of the kernel must not alias into it, so that half of all
-    differences and half of the kernel have to fit side by side.
+    differences and half of the kernel, of what reaches the sensor, have to fit side by side.
     """
     sizes = zip(sensor_shape, field_shape, kernel, strict=True)
-    rows, columns = (max(s, f, math.ceil((s + f + k - 2) / 2)) for s, f, k in sizes)
+    reach = ((s, f, min(k, s + f - 1)) for s, f, k in sizes)
+    rows, columns = (max(s, f, math.ceil((s + f + k - 2) / 2)) for s, f, k in reach)
     return fast_shape((rows, columns), real=True)
 
 
