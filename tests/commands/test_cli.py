@@ -214,7 +214,7 @@ start.main()
 """
 _SWALLOWED = """
 import gc, os, signal, sys, time
-from thincam_jax.commands import interrupt
+from thincam_jax.commands import terminal as interrupt
 signal.signal(signal.SIGINT, interrupt.leave)
 sys.unraisablehook = interrupt._again
 gc.callbacks.append(lambda phase, _: phase == "stop" and os.kill(os.getpid(), signal.SIGINT))
