@@ -59,7 +59,7 @@ from thincam_jax.reconstruction.wiener import Wiener, filter_suffices
 _BALANCED = 30
 # How often pixels are made twice as large, and the tolerance there: the image is only a start.
 # From it an image ends that changes by less than this times the tolerance in ten iterations.
-_COARSER, _ROUGH, _STILL = 2, 3e-3, 200.0
+_COARSER, _ROUGH, _STILL = 2, 3e-3, 100.0
 # Variation of an image whose smooth light counts less, in parts of the first one's, below which it
 # is taken: 0.35 to 0.85 where shading had spoilt detail. That of a real hand is 1.0, with haze.
 _CALMER = 0.92
