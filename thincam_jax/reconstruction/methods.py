@@ -284,7 +284,7 @@ class AdmmTV(AbstractRegularised):
     - `synthesis`: sums of captures in place of the captures, see
       `thincam_jax.reconstruction.synthesis`; for `Cameras` only.
     - `iterations`: at most. `tolerance`: relative residuals at which they end. So does, from an
-      image on larger pixels, a change of the image over ten iterations by 200 times as much, 2 %;
+      image on larger pixels, a change of the image over ten iterations by 100 times as much, 1 %;
       else one of the objective over 20 by a tenth of a percent, of less as the square of less.
 
     **Errors**: ValueError, one line, for values out of range.
