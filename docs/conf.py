@@ -276,7 +276,7 @@ CARDS = {
     "in_a_notebook": ("usaf-1951.png", 1182, 326, 186),
     "learned_refocus": ("learned.png", 631, 42, 194),
     "moving_objects": ("moving-objects.png", 592, 31, 256),
-    "optical_chart": ("optical-chart-lines.png", 880, 30, 220),
+    "optical_chart": ("optical-chart-lines.png", 893, 44, 190),
     "own_sensor": ("design-landscape.png", 169, 4, 369),
     "phase_mask": ("phase-masks.png", 800, 345, 162),
     "prior": ("prior.png", 1016, 48, 294),
