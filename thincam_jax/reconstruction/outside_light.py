@@ -33,7 +33,7 @@ _SUSPECTED, _STAYS, _LEFT = 1.5, 0.7, 8.0
 # Part of the field's brightness that is an object, not haze that explains shading; the least share
 # of the light that counts, and the share that may stay outside of the field named.
 _BRIGHT, _COUNTS, _BEYOND = 0.2, 0.05, 0.01
-_HALVED, _SCHEDULE = 2, Schedule(50, 3e-3, settled=3e-2)
+_HALVED, _SCHEDULE = 2, Schedule(50, 3e-3, adapt_until=25, settled=3e-2)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def outside_light(
         return None
     start = place(image, middle_corner(field, wide.field_shape), wide.field_shape)
     wide, start, size = coarsened(wide, start, _HALVED)
-    method = in_parallel(wide, admm_method, start)
+    method = in_parallel(wide, admm_method)
     found = iterate(method, start, _SCHEDULE).image
     before, after = (misfit_of(wide, one) for one in (start, found))
     if before is None or after is None:
