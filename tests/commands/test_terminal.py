@@ -10,7 +10,8 @@ from commands.study import tiny
 from commands.sweep import mini
 from commands.test_cli import call, one_line
 
-from thincam_jax._core.table import Table, escaped
+from thincam_jax._core.table import Table
+from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 
 EVIL = "\x1b[31m\x07\u202e[/red]\x9b\r\u2028"

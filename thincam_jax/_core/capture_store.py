@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax._core.files import MeasurementError, writing
-from thincam_jax._core.table import of_error
+from thincam_jax._core.text import of_error
 
 CALIBRATION = "Hadamard captures"  # a store whose frames are those of a `HadamardSeries`
 CAPTURES = "captures"  # any other

@@ -4,9 +4,7 @@ Traced values cannot be looked at and pass; they were checked when the object wa
 """
 
 import contextlib
-import difflib
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, cast
@@ -17,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Real
 
-from thincam_jax._core.table import shortened
+from thincam_jax._core.text import nearest, shortened
 
 # What users give: checked below, which tells a wrong value in one line, and not by its type.
 if TYPE_CHECKING:
@@ -358,10 +356,8 @@ def choice(name: str, value: Any, options: Iterable[str]) -> str:
     options = tuple(options)
     if not isinstance(value, str) or value not in options:
         listed = ", ".join(repr(o) for o in options)
-        plain = {re.sub(r"[\W_]", "", one).casefold(): one for one in options}
-        given = re.sub(r"[\W_]", "", value).casefold() if isinstance(value, str) else ""
-        near = difflib.get_close_matches(given, plain, 1)
-        hint = f"; did you mean {plain[near[0]]!r}?" if near else ""
+        near = nearest(value, options) if isinstance(value, str) else []
+        hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"{name} = {shown(value)} is unknown; choose one of {listed}{hint}")
     return value
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.table import escaped
+from thincam_jax._core.text import escaped
 
 
 class MeasurementError(ValueError):

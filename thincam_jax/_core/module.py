@@ -1,7 +1,6 @@
 """Modules that print the values of their numbers, with units."""
 
 import dataclasses
-import difflib
 import inspect
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -10,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import wadler_lindig as wl
-from jaxtyping import PRNGKeyArray
 
 from thincam_jax._core.arguments import any_rank, refuse_unsound
-from thincam_jax._core.checks import shown
 from thincam_jax._core.quantity import Quantity, unchecked
+from thincam_jax._core.text import nearest
 
 _MOST = 4  # numbers of an array that are shown, not counted
 _PLAIN = unchecked()
@@ -66,7 +64,7 @@ class Module(AnyRank):
         names = list(inspect.signature(type(self)).parameters)
         for name in changes:
             if name not in names:
-                near = difflib.get_close_matches(name, names) or names
+                near = nearest(name, names) or names
                 raise TypeError(f"{type(self).__name__} has no {name}; give {', '.join(near)}")
         kept = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return type(self)(**kept | changes)
@@ -94,16 +92,3 @@ def _shown(converter: Any, value: Any) -> Any:
     if np.ndim(value) > 1 or np.size(value) > _MOST or not is_number:
         return value
     return wl.TextDoc(quantity.text(value))
-
-
-Key = PRNGKeyArray | int
-
-
-def random_key(key: Key) -> PRNGKeyArray:
-    """The key itself, or that of a seed, `jax.random.key(seed)`."""
-    if isinstance(key, int | np.integer) and not isinstance(key, bool) and 0 <= key < 2**64:
-        return jax.random.key(key)
-    if isinstance(key, jax.Array):
-        if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key) or key.dtype == "uint32":
-            return key
-    raise TypeError(f"key is {shown(key)}; give a seed, 0 or more, or jax.random.key(seed)")

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from thincam_jax._core.text import nearest
+
 
 def lazy_face(package: str) -> tuple[Any, Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package whose names stand in its stub, `__init__.pyi`.
@@ -42,10 +44,8 @@ def modules_of(package: str, names: Callable[[str], Any] | None = None) -> Any:
             return names(name)
         if not name.startswith("_") and importlib.util.find_spec(path):
             return importlib.import_module(path)
-        import difflib
-
         near = [one for one in known if one.startswith(name)]
-        near = (near or difflib.get_close_matches(name, known))[:3]
+        near = (near or nearest(name, known))[:3]
         hint = f": did you mean {' or '.join(near)}?" if near else ""
         raise AttributeError(f"{package} has no name {name}{hint}", name=name)
 

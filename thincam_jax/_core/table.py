@@ -1,4 +1,4 @@
-"""Tables of results, and texts of files and users in messages: escaped, and cut to a length."""
+"""Tables of results: numbers and texts, as Markdown, in a terminal and on a page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,23 +62,3 @@ def _line(row: Sequence[str], widths: Sequence[int]) -> str:
     first, *others = zip(row, widths, strict=True)
     cells = [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]
     return f"| {' | '.join(cells)} |"
-
-
-def escaped(text: str) -> str:
-    """Text whose control characters and marks of writing direction are written out."""
-    return "".join(c if c.isprintable() or c in "\n\xa0\u202f" else ascii(c)[1:-1] for c in text)
-
-
-def shortened(text: str, longest: int = 60) -> str:
-    """The begin of a text, with its number of characters where it is longer."""
-    return text if len(text) <= longest else f"{text[:longest]}… ({len(text)} characters)"
-
-
-def of_error(error: BaseException) -> str:
-    """Kind and text of an error of another library, in a line."""
-    return shortened(f"{type(error).__name__}: {' '.join(str(error).split())}", 200)
-
-
-def spelled(value: object) -> str:
-    """A value as YAML has it."""
-    return {"None": "null", "True": "true", "False": "false"}.get(repr(value), str(value))

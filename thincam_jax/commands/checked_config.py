@@ -6,7 +6,7 @@ from typing import Any, TypeVar, get_args
 import pydantic
 import yaml
 
-from thincam_jax._core.table import shortened, spelled
+from thincam_jax._core.text import shortened, spelled
 from thincam_jax.commands.config_file import ConfigError, Places, override, read_raw
 from thincam_jax.commands.sections import ExperimentConfig
 

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from thincam_jax._core.files import TooLargeError, read_regular
-from thincam_jax._core.table import shortened
+from thincam_jax._core.text import shortened
 
 _MOST_ENTRIES = 100_000
 _LONGEST_NUMBER = 200  # characters; of larger numbers, Python makes none, or no text

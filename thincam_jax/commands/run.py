@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax._core.table import spelled
+from thincam_jax._core.text import spelled
 from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment
 from thincam_jax.commands.terminal import (
     ConfigFile,

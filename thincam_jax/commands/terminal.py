@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from thincam_jax._core.progress import repeating
-from thincam_jax._core.table import escaped
+from thincam_jax._core.text import escaped
 
 if TYPE_CHECKING:
     import rich.progress

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
-from thincam_jax._core.module import Key, random_key
 from thincam_jax._core.progress import watched
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design, Shot
 from thincam_jax.design.objectives import ObjectiveData, ResolutionLimit, bayes_error, limit
 from thincam_jax.design.problem import DesignProblem

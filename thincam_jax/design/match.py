@@ -30,8 +30,9 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.progress import watched
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import Channels, channels, ring_means
 from thincam_jax.design.search import (

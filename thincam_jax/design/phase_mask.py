@@ -28,8 +28,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.end_to_end import restore_by
 from thincam_jax.design.objectives import Channels, bayes_error
 from thincam_jax.design.phase_retrieval import contour_target, match_error, retrieve_phase

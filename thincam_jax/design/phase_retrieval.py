@@ -13,8 +13,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor, squared_modulus
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner, place
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.propagation.angular_spectrum import (

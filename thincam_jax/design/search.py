@@ -21,9 +21,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import whole
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.space import DesignSpace, active_limits

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.search import on_cube

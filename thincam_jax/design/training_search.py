@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax._core.module import Key, random_key
 from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import whole
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.design import Design
 from thincam_jax.design.end_to_end import end_to_end_error
 from thincam_jax.design.landscape import Landscape, drawn_variables, landscape_if_any

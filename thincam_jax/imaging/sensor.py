@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.module import Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, choice, quantity, whole
+from thincam_jax._core.random import random_key
 
 Pictures = Float[Array, "*batch y x"]
 Electrons = Float[Array, "*batch 1 1"]  # per unit of each picture

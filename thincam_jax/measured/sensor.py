@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import MeasurementError, read_arrays, write_whole
 from thincam_jax._core.progress import watched
-from thincam_jax._core.table import of_error
+from thincam_jax._core.text import of_error
 from thincam_jax.measured.exposures import ExposedFrames, moments, variance
 from thincam_jax.measured.raw import Raw
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.module import random_key
 from thincam_jax._core.progress import watched
+from thincam_jax._core.random import random_key
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise
 from thincam_jax.lensless.camera import LenslessCamera

@@ -13,7 +13,7 @@ import rich.progress
 from thincam_jax import measured
 from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError
-from thincam_jax._core.table import escaped
+from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.jobs import Inputs, Job, write_job
 from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources

@@ -22,7 +22,7 @@ from thincam_jax._core.capture_store import (
     CaptureStoreError,
     dtype_of_bits,
 )
-from thincam_jax._core.table import of_error, shortened
+from thincam_jax._core.text import of_error, shortened
 from thincam_jax.hardware.acquisition.plan import BLACK, AcquisitionPlan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
     Recorder,

@@ -8,7 +8,7 @@ import numpy as np
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest, listed
 from thincam_jax._core.files import read_regular
-from thincam_jax._core.table import of_error
+from thincam_jax._core.text import of_error
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN, frame_records, read_journal
 from thincam_jax.hardware.base import CameraSettings

@@ -28,7 +28,7 @@ from filelock import Timeout as LockTimeout
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest
 from thincam_jax._core.files import read_regular, write_whole, writing
-from thincam_jax._core.table import of_error
+from thincam_jax._core.text import of_error
 from thincam_jax.hardware.acquisition.plan import canonical_json
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax._core.table import of_error
+from thincam_jax._core.text import of_error
 from thincam_jax.hardware import base
 from thincam_jax.hardware.base import (
     SOFTWARE,

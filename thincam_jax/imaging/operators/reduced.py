@@ -17,7 +17,7 @@ from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 from thincam_jax._core.checks import Shape
 from thincam_jax._core.files import read_arrays, write_whole
 from thincam_jax._core.precision import product
-from thincam_jax._core.table import of_error
+from thincam_jax._core.text import of_error
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
     real_numbers,

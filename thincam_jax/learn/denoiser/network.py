@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
-from thincam_jax._core.table import of_error
+from thincam_jax._core.random import Key, random_key
+from thincam_jax._core.text import of_error
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     network_description,

@@ -23,9 +23,10 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
-from thincam_jax._core.table import of_error
+from thincam_jax._core.random import Key, random_key
+from thincam_jax._core.text import of_error
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     network_description,

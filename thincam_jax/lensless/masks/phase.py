@@ -15,9 +15,10 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, fast_shape
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax._core.quantity import choice, quantity
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.sampled import SampledMask

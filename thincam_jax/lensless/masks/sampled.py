@@ -13,9 +13,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.module import Key, random_key
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import quantity
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AxisFactors,

@@ -25,7 +25,7 @@ from thincam_jax._core.capture_store import (
     listed,
 )
 from thincam_jax._core.checks import Shape
-from thincam_jax._core.module import Key, random_key
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.imaging.operators import AbstractOperator
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.measured.calibration.hadamard import HadamardSeries

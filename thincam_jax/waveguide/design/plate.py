@@ -27,8 +27,9 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
-from thincam_jax._core.module import Key, Module, random_key
+from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.search import best_apart, even_samples, on_cube
 from thincam_jax.design.setup import PowerLaw
 from thincam_jax.design.stochastic import adam

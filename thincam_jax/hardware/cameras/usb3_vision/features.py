@@ -16,7 +16,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 from genicam import genapi
 
-from thincam_jax._core.table import shortened
+from thincam_jax._core.text import shortened
 from thincam_jax.hardware.cameras.features import Number, Value
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm

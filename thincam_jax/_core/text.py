@@ -1,0 +1,36 @@
+"""Texts of files and users in messages: escaped, cut to a length, and names near what was meant."""
+
+import re
+from collections.abc import Iterable
+
+
+def escaped(text: str) -> str:
+    """Text whose control characters and marks of writing direction are written out."""
+    return "".join(c if c.isprintable() or c in "\n\xa0\u202f" else ascii(c)[1:-1] for c in text)
+
+
+def shortened(text: str, longest: int = 60) -> str:
+    """The begin of a text, with its number of characters where it is longer."""
+    return text if len(text) <= longest else f"{text[:longest]}… ({len(text)} characters)"
+
+
+def of_error(error: BaseException) -> str:
+    """Kind and text of an error of another library, in a line."""
+    return shortened(f"{type(error).__name__}: {' '.join(str(error).split())}", 200)
+
+
+def spelled(value: object) -> str:
+    """A value as YAML has it."""
+    return {"None": "null", "True": "true", "False": "false"}.get(repr(value), str(value))
+
+
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """At most three of the known names that are spelled nearly so, nearest first.
+
+    Capitals, underscores and hyphens do not count: "AdmmTV" is "admm_tv".
+    """
+    import difflib  # here, since only messages need it
+
+    plain = {re.sub(r"[\W_]", "", one).casefold(): one for one in known}
+    given = re.sub(r"[\W_]", "", name).casefold()
+    return [plain[one] for one in difflib.get_close_matches(given, plain)]
