@@ -10,7 +10,7 @@ import scipy.signal
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.reconstruction.other_psf import _mirror
+from thincam_jax.reconstruction.other_psf import _FIT, RESIZE, TURN, _mirror, without_size
 
 RNG = np.random.default_rng(5)
 SHAPE = (52, 61)
@@ -63,3 +63,11 @@ def test_symmetric_and_otherwise_wrong_psfs_are_not_turned():
     for psf in (other, (other + np.flip(other)) / 2, other + other[::-1]):
         found = tc.reconstruct(tc.Recording([CAPTURE], tc.Psfs(psf[None])), SOLVER)
         assert "fit far better" not in found.reason
+
+
+def test_light_from_outside_takes_the_place_of_another_size_alone():
+    """How τ was found stays, and so does a PSF that is turned."""
+    rule = "tau = 3.2 by the discrepancy principle"
+    larger, turned = f"{_FIT} has 0.94 times the size; {RESIZE}", f"{_FIT} is upside down; {TURN}"
+    assert without_size(f"{rule}; {larger}") == rule and without_size(larger) == ""
+    assert without_size(f"{rule}; {turned}") == f"{rule}; {turned}"

@@ -18,6 +18,7 @@ from thincam_jax.reconstruction.regularisers import Image
 
 TURN = "turn the PSF or the captures"
 RESIZE = "refine it (thincam calibrate check --refine), or the cameras' distance"
+_FIT = "the captures fit far better a PSF that"
 MIRRORED = {"upside down": (-2,), "mirrored left to right": (-1,), "turned by 180°": (-2, -1)}
 _SCALES = (0.94, 0.97, 1.03, 1.06)
 _COARSER = 2  # times twice as large
@@ -56,7 +57,12 @@ def better_psf(
         found |= {f"has {s:g} times the size; {RESIZE}": objective(_resize(s)) for s in _SCALES}
     best = min(found, key=lambda name: found[name])
     is_better = found[best] < _BETTER * solve(problem, image)
-    return f"the captures fit far better a PSF that {best}" if is_better else ""
+    return f"{_FIT} {best}" if is_better else ""
+
+
+def without_size(reason: str) -> str:
+    """A reason without the sentence that a PSF of another size fits better."""
+    return reason.partition(_FIT)[0].rstrip("; ") if reason.endswith(RESIZE) else reason
 
 
 def _mirror(axes: tuple[int, ...]):

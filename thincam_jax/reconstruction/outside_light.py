@@ -18,7 +18,7 @@ from thincam_jax.imaging.operators.crop_convolution import middle_corner, place
 from thincam_jax.reconstruction.coarse import coarsened
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import Schedule, iterate
-from thincam_jax.reconstruction.other_psf import RESIZE
+from thincam_jax.reconstruction.other_psf import without_size
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
@@ -118,8 +118,7 @@ def reaching_beyond(
     if outside is None:
         return result
     if recording.imaging_model.pixels is not None:  # type: ignore[union-attr]
-        said = "" if result.reason.endswith(RESIZE) else result.reason
-        return saying(dataclasses.replace(result, reason=""), said, str(outside))
+        return saying(result, without_size(result.reason), str(outside))
     again = solve(with_field(recording, outside.field_shape))
     return saying(again, outside.taken, again.reason)
 
