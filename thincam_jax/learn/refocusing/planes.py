@@ -90,8 +90,8 @@ class LinearStep(eqx.Module):
 
     - `power`: ln p, of scenes of mean radiance 1, of each place where a plane may stand.
     - `slope`: γ; photographs have about 1, what is left of them after a few steps less.
-    - `noise`: ln of the factor on the noise's own spectrum, and ln of what is added to it for all
-      that the model leaves out.
+    - `noise`: two logarithms: of a factor on the power of the noise, and of a power added to it
+      for what the model leaves out.
     """
 
     power: Float[Array, " place"]
@@ -136,7 +136,7 @@ class LinearStep(eqx.Module):
 
 
 def _mean(spectrum: Float[Array, "v u"], window: tuple[int, int]) -> Float[Array, ""]:
-    """Mean over the whole plane of what is given on the half plane."""
+    """Mean over all frequencies of a real image's spectrum, given for u ≥ 0 as by `rfft2`."""
     weights = np.full(spectrum.shape[-1], 2.0)
     weights[0] = 1.0
     if window[1] % 2 == 0:
