@@ -102,6 +102,14 @@ def test_it_counts_and_goes(at_terminal):
     assert shown.endswith("\r") and not shown.split("\r")[-2].strip()  # the line is gone
 
 
+def test_it_goes_where_the_call_fails(at_terminal):
+    watched = progress.watched("looking")
+    with pytest.raises(KeyError), contextlib.redirect_stderr(at_terminal), watched:
+        time.sleep(0.1)
+        raise KeyError
+    assert at_terminal.getvalue().endswith("\r")
+
+
 def test_what_is_quick_or_within_another_call_shows_nothing(at_terminal, monkeypatch):
     inner = progress.watched("inner")(time.sleep)
     with contextlib.redirect_stderr(at_terminal), progress.watched("outer"):
