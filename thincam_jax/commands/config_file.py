@@ -1,6 +1,5 @@
 """The text of an experiment file: YAML read with the lines of its entries, values set by path."""
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -184,8 +183,3 @@ def read_value(text: str, asked: str) -> Any:
     except (yaml.YAMLError, ValueError):
         given = shortened(repr(text))
         raise ConfigError(f"{asked}: {given} is not valid YAML; put texts in quotes") from None
-
-
-def slug(name: str) -> str:
-    """A name as a file name."""
-    return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-._") or "unnamed"

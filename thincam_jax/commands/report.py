@@ -15,8 +15,8 @@ import PIL.Image
 
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.table import Table
+from thincam_jax._core.text import slug
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.sections import CamerasConfig
 
 

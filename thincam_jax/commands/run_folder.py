@@ -17,8 +17,9 @@ from thincam_jax._core.environment import environment, installed
 from thincam_jax._core.files import WriteError, file_digest, read_json, read_regular, write_whole
 from thincam_jax._core.precision import is_double
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.text import slug
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sections import ExperimentConfig

@@ -8,7 +8,8 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.config_file import ConfigError, Places, slug
+from thincam_jax._core.text import slug
+from thincam_jax.commands.config_file import ConfigError, Places
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.schema import (
     Angle,
@@ -339,13 +340,14 @@ def _check_family(config: CamerasConfig) -> None:
 
 def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
     """A method of a file, with all of its exposures."""
-    published = method.published
+    published, phases = method.published, method.shot_phases()
+    solver = build_solver(method.kind, method.variation, config.prior)
     return Method(
         method.name,
         exposures_of(config, method),
-        build_solver(method.kind, method.variation, config.prior),
+        solver,
         method.synthesis,
-        len(method.shot_phases()),
+        len(phases),
         method.harmonics,
         Published(published.psnr_db, published.resolved, published.limit_cycles_per_mm),
     )
@@ -353,7 +355,7 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
 
 def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
     """Each shot of a method at each of its phases; one after another where the object moves."""
-    shots = method.shots
+    shots, phases = method.shots, method.shot_phases()
     settings = Exposures(
         [shot.beta or 0.0 for shot in shots],  # 0: of a mask without zones
         [shot.distance for shot in shots],
@@ -363,7 +365,7 @@ def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
         profile=[shot.profile for shot in shots],
         take=[shot.take or 1 for shot in shots],
     )
-    exposures = settings.at_phases(method.shot_phases())
+    exposures = settings.at_phases(phases)
     return exposures.of_moving(config.motion) if config.motion else exposures
 
 

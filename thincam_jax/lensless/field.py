@@ -165,7 +165,7 @@ def field_operator(
     tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
     method = replace(as_method(model, pixel_integration=True), field_tolerance=tolerance)
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
-    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
+    colours = spectrum.colours
     return field_fit(camera, colours, object_distance, field_shape, method)
 
 

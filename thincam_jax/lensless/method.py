@@ -12,6 +12,7 @@ import numpy as np
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, AccuracyWarning, Precision, precision_of
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -21,6 +22,7 @@ from thincam_jax.lensless.masks.base import (
 )
 from thincam_jax.lensless.masks.phase import PhaseMask
 from thincam_jax.lensless.masks.pinhole import RadialMask
+from thincam_jax.lensless.propagation.skew import focuses_on_a_line
 
 Model = Literal[
     "geometric",
@@ -44,6 +46,8 @@ CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMP
 PIXEL_NODES = 24
 # Points a pixel for its average then: 1 to 4 % off where a pixel holds some ten fringes.
 LATTICE_POINTS = 21
+# Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
+_IN_CELL, _UNKNOWN_CELL = 16, 7
 _LATTICE = (
     "pixel averages of a mask of {} are taken at "
     f"{LATTICE_POINTS} points a pixel, 1 to 4 % off where cells are fine; "
@@ -172,6 +176,31 @@ def psf_method(
         oversampling=method.oversampling or max(least, _samples_of_cells(mask, grid)),
         mask_shape=method.mask_shape or _mask_plane(mask, grid),
     )
+
+
+def sampled_off_axis(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> PsfMethod:
+    """The method; in place of "separable" samples where a mask of edges has no closed form.
+
+    That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
+    zones that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
+    edge's wave, leave about 1 %.
+    """
+    if method.model != "separable" or path.at is None:
+        return method
+    cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
+    beyond = path.skew and (cells or focuses_on_a_line(mask, path))
+    if not (beyond or mask.exact_model == "radial"):
+        return method
+    samples = _UNKNOWN_CELL
+    if not checks.holds_traced(mask, grid, replace(path, at=None)):
+        with jax.ensure_compile_time_eval():  # they are known under jit, too
+            zone = math.sqrt(path.wavelength * path.distance / path.magnification)
+            finest = mask.finest_frequency
+            cell = zone if finest is None else 0.5 / float(finest)
+            samples = odd_from(_IN_CELL * float(grid.pitch) / math.sqrt(cell * zone))
+    return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
 
 
 def require_odd(oversampling: int) -> None:

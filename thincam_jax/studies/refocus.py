@@ -178,7 +178,7 @@ class RefocusStudy:
     def capture(self, exposure: Exposure) -> Capture:
         """One capture of all objects together, (y, x)."""
         planes = [target.plane for target in self.study.targets]
-        return expose(self.study, exposure, noise_free(self.study, exposure, planes), 0)
+        return expose(self.study, exposure, noise_free(self.study, exposure, *planes), 0)
 
     def field_shape(self, method: Method) -> tuple[int, int]:
         """Pixels of a reconstruction: all directions of objects about the axis, and a margin."""

@@ -56,9 +56,10 @@ def capture(
 
     with reported(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import write_whole
+        from thincam_jax._core.text import slug
         from thincam_jax.commands import run
         from thincam_jax.commands.checked_config import dump_config
-        from thincam_jax.commands.config_file import ConfigError, slug
+        from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.run_folder import to_json
         from thincam_jax.hardware.acquisition.acquire import acquire
@@ -136,8 +137,9 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
 
     **Errors**: ConfigError or MeasurementError, one line, for a folder that is no complete store.
     """
+    from thincam_jax._core.text import slug
     from thincam_jax.commands.checked_config import load_as
-    from thincam_jax.commands.config_file import ConfigError, slug
+    from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.commands.run_folder import RunFolder
     from thincam_jax.commands.terminal import counted
     from thincam_jax.hardware.commands.config import CaptureConfig

@@ -131,7 +131,7 @@ def compare_frames(
     camera, target = rig.camera, study.targets[0]
     assert camera is not None
     light = [
-        np.stack([noise_free(study, exposure, [*scene.planes]) for exposure in method.exposures])
+        np.stack([noise_free(study, exposure, *scene.planes) for exposure in method.exposures])
         for method, scene in zip(study.methods, scenes_of(study), strict=True)
     ]
     part = np.stack(light, axis=1)[..., *rig.pixels]  # capture, colour, y, x

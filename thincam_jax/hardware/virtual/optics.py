@@ -105,7 +105,7 @@ class ModulatorOptics:
                     fill_factor=self.fill_factor,
                     gap=0.0 if self.phases is None else self.phases.gap,
                 )
-                for wavelength, weight in zip(spectrum.wavelengths, spectrum.weights, strict=True)
+                for wavelength, weight in spectrum.colours
             ]
             kernel = functools.reduce(jnp.add, kernels)
             convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)

@@ -176,7 +176,7 @@ class RefocusCamera(eqx.Module):
         """The PSFs at these distances, mm, on `support` pixels."""
         grid = self.camera.sensor.grid.with_shape(self.support)
         method = PsfMethod(self.model, pixel_integration=True)
-        light = list(zip(self.light.wavelengths, self.light.weights, strict=True))
+        light = self.light.colours
         return jax.vmap(lambda t: spectral_psf(self.camera, light, t, method, grid))(distances)
 
     def _support(self) -> tuple[int, int]:
