@@ -76,8 +76,8 @@ class Landscape:
         - `costs`: where they are drawn over a single number; by default on the line.
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
-        from thincam_jax.plot.cameras import draw_landscape
         from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.objectives import draw_landscape
 
         ax = new_figure(7.6, 6.0).subplots() if ax is None else ax
         draw_landscape(self, ax, designs or {}, costs or {})

@@ -20,8 +20,8 @@ from thincam_jax.lensless.masks.base import (
     term_count,
     zone_orders,
 )
+from thincam_jax.lensless.masks.openings import RadialMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.propagation.skew import focuses_on_a_line
 
 Model = Literal[

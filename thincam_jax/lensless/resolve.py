@@ -26,8 +26,8 @@ from thincam_jax.lensless.masks.base import (
     other_models,
     term_count,
 )
+from thincam_jax.lensless.masks.openings import RadialMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     SAMPLED,

@@ -278,7 +278,7 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
 def _focus(job: Job, ready: Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
     """The image of a network; its record is of the method alone."""
     from thincam_jax.learn.plot import draw_unsure
-    from thincam_jax.learn.refocusing.use import SURE, doubt, read
+    from thincam_jax.learn.refocusing.learned import SURE, doubt, read
     from thincam_jax.plot.frame import as_png
 
     began = time.perf_counter()
