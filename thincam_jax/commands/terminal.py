@@ -75,13 +75,17 @@ WRONG_INPUT = 2
 output: Literal["text", "json", "nothing"] = "text"
 _MOST_LINES, _HALF = 10, 500  # of an error; characters of each half of a line that is cut
 
-ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); thincam init makes one.")]
+ConfigFile = Annotated[
+    Path, typer.Argument(help="Experiment file (YAML); 'thincam init' writes one.")
+]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
+    typer.Option(
+        "--set", help="Change a value of the file: a.b=value; entries of lists by number, from 0."
+    ),
 ]
 DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Check all and tell what would be done, without doing it.")
+    bool, typer.Option("--dry-run", help="Check everything and list the work, without doing it.")
 ]
 
 
