@@ -25,7 +25,7 @@ QUANTITIES = quantities(Design)  # what may be free
 
 @dataclass(frozen=True)
 class ReportedNumber:
-    """Format in which a number of a shot is reported, in the unit of its field; light in nm.
+    """Format in which a number of a shot is reported, in the unit of its attribute; light in nm.
 
     - `name`: in tables and on axes.
     """

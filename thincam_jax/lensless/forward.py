@@ -51,7 +51,7 @@ def imaging_operator(
     """The operator from a plane's projection on the sensor's pitch to the noise-free capture.
 
     `light` is a `Spectrum` or one wavelength in mm; the PSF is the weighted sum over it. The other
-    arguments are those of `psf`. With a method's `field_tolerance` it is a `field_operator`.
+    arguments are those of `psf`. With a `field_tolerance` it is a `field_operator`.
     """
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
     method = as_method(model, pixel_integration)

@@ -56,7 +56,7 @@ _LATTICE = (
 
 
 def parts_of(mask: AbstractMask) -> str:
-    """Number of those whose fields an exact model adds up, in words."""
+    """Number of terms, rings or samples whose waves a model adds up, in words."""
     if isinstance(mask, AbstractFactoredMask):
         return f"{term_count(mask).terms} terms"
     return f"{mask.rings.size} rings" if isinstance(mask, RadialMask) else "samples"
@@ -74,7 +74,7 @@ def models_of(mask: AbstractMask) -> tuple[Model, ...]:
 
 @dataclass(frozen=True)
 class PsfMethod:
-    """Method for computing a PSF: a model with its settings, in place of the model's name.
+    """A model of the PSF with its settings, in place of the model's name.
 
     - `model`: "geometric", "paraxial", "closed_form", "separable", "radial", "angular_spectrum" or
       "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`. "separable",
@@ -149,7 +149,7 @@ class PsfMethod:
 
 
 def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMethod:
-    """The method of that name, or itself, averaged over pixels unless either says no."""
+    """A model's settings, given or by its name; averaged over pixels unless either says no."""
     method = model if isinstance(model, PsfMethod) else PsfMethod(model)
     return method if pixel_integration else replace(method, pixel_integration=False)
 
@@ -157,7 +157,7 @@ def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMe
 def psf_method(
     mask: AbstractMask, grid: Grid, model: Model | PsfMethod, pixel_integration: bool = True
 ) -> PsfMethod:
-    """The method with the defaults for a mask and grid in place of None."""
+    """The settings with the defaults for a mask and grid in place of None."""
     method = as_method(model, pixel_integration)
     precision = method.precision or precision_of(grid.pitch)
     method = replace(method, precision=precision, field_tolerance=None)
@@ -181,10 +181,10 @@ def psf_method(
 def sampled_off_axis(
     mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> PsfMethod:
-    """The method; in place of "separable" samples where a mask of edges has no closed form.
+    """The settings given, or those of samples where "separable" has no closed form.
 
-    That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
-    zones that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
+    Rings have none off the axis; cells off both axes, whose integrals do not separate; and zones
+    that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
     edge's wave, leave about 1 %.
     """
     if method.model != "separable" or path.at is None:

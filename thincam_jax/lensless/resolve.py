@@ -378,7 +378,7 @@ def resolve(
     model: Model | PsfMethod,
     pixel_integration: bool = True,
 ) -> tuple[AbstractMask, Grid, LightPath, PsfMethod]:
-    """Mask, samples and path in the method's precision, and the method with all defaults chosen.
+    """Mask, samples and path in the chosen precision, and the model with all settings chosen.
 
     Nothing is examined after it: a model takes these as they are.
 

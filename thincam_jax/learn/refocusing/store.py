@@ -26,7 +26,7 @@ _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
 
 
 def described(value: Any) -> Any:
-    """Every number of a module as JSON, by the names of its fields."""
+    """Every number of a module as JSON, by the names of its attributes."""
     if isinstance(value, eqx.Module):
         fields = (field.name for field in dataclasses.fields(value))
         numbers = {name: described(getattr(value, name)) for name in fields}

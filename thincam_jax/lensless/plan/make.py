@@ -66,7 +66,7 @@ def knows_field(seen: SeenScene) -> bool:
 
 
 def choose_field(seen: SeenScene, method: PsfMethod, tolerance: float) -> tuple[PsfMethod, float]:
-    """The method with the PSF and the light of the axis, the light or both of every point.
+    """The model with the PSF and light of the axis, or with the light or both of every point.
 
     The first that is within the tolerance.
     """
@@ -91,7 +91,7 @@ def choose_field(seen: SeenScene, method: PsfMethod, tolerance: float) -> tuple[
 
 
 def _own(seen: SeenScene, method: PsfMethod, share: float) -> tuple[PsfMethod, float]:
-    """The method of every point's own PSF, and its relative error; infinite of lenses."""
+    """The model with each point's own PSF, and its relative error; infinite for lenses."""
     mask = seen.camera.mask
     if zone_orders(mask) is not None:
         share = min(max(share, _SMALLEST), _LARGEST)
