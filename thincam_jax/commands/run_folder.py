@@ -55,7 +55,7 @@ class RunFolder:
 
     @classmethod
     def chosen(cls: type[Folder], out: Path | None, name: str, config: Section) -> Folder:
-        """The folder asked for, or runs/NAME; where that is another's, runs/NAME-2 and so on."""
+        """The folder given, or runs/NAME; if another run has that, runs/NAME-2 and so on."""
         first, number = out or Path("runs") / slug(name), 1
         folder = cls(first)
         while out is None and not folder._is_open_to(config):

@@ -41,7 +41,7 @@ class SensorConfig(section(Sensor)):
 
 
 class ObjectConfig(Section):
-    """Where the targets stand and how wide they are."""
+    """Distance and width of the targets."""
 
     distance: Length
     width: Length
@@ -300,7 +300,7 @@ class StudyConfig(CamerasConfig):
 
 
 def check_known(name: str, what: str, names: Sequence[str], *place: Any) -> None:
-    """Refuse a name that is none of those of a list."""
+    """Refuse a name that a list does not have."""
     if name not in names:
         raise FieldError(f"{name!r} is no {what}; choose one of {', '.join(names)}", *place)
 

@@ -121,7 +121,7 @@ def reported(interrupted: Callable[[], str]) -> Iterator[None]:
 
 
 def _no_memory(error: BaseException) -> bool:
-    """Whether Python or XLA could not have what they asked for; the texts of either say nothing."""
+    """Whether Python or XLA ran out of memory and says nothing of use."""
     return str(error).startswith("RESOURCE_EXHAUSTED") or (
         isinstance(error, MemoryError) and not str(error)
     )

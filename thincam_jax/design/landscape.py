@@ -55,7 +55,7 @@ class Landscape:
         return np.asarray(costs, dtype=float)
 
     def place(self, design: Design) -> tuple[float, ...]:
-        """Where a design lies on the axes, in the units of the plot."""
+        """Place of a design on the axes, in the units of the plot."""
         firsts = [(own[0] - 1) * design.phases if own else 0 for _, own in self.variables]
         return tuple(
             float(np.asarray(getattr(design, name), dtype=float).ravel()[first])

@@ -145,7 +145,7 @@ def contour_mask(
 
 @checked
 class MaskSetting(eqx.Module):
-    """Where a mask is designed: its sensor, and the light that it meets.
+    """Setting of a mask's design: its sensor, and the light that it meets.
 
     - `sensor`, `distance`: mask to sensor, mm. `wavelengths`, `object_distances`: mm.
     - `together`: the sensor sees all wavelengths as one grey image; else each has its own.

@@ -67,7 +67,7 @@ class NonFiniteObjectiveError(ValueError):
 
 
 class Descents(eqx.Module):
-    """Where a start ended, or each of many, and how many evaluations of the objective it took."""
+    """End of one descent, or of each of many, and the evaluations of the objective it took."""
 
     points: Float[Array, "*start variable"]
     values: Float[Array, "*start"]

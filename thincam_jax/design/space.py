@@ -176,7 +176,7 @@ class DesignSpace(eqx.Module):
         return self.lower + point * (self.highest(width) - self.lower)
 
     def point(self, design: Design) -> Float[Array, " variable"]:
-        """Where a design lies in the unit cube, or outside of it; ½ where there is no room.
+        """Place of a design in the unit cube, or outside of it; ½ along an axis without extent.
 
         Of a number that captures share, the first one's counts.
         """

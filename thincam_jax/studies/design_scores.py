@@ -273,7 +273,7 @@ class FrontScores:
 
 @dataclass(frozen=True)
 class FrontsScores:
-    """The fronts that were asked for; `highest_cycles_per_rad`: that was looked at."""
+    """The fronts requested; `highest_cycles_per_rad`: highest frequency evaluated."""
 
     highest_cycles_per_rad: float
     thickness: FrontScores | None = None

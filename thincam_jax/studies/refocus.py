@@ -341,7 +341,7 @@ class RefocusResult:
     images: dict[tuple[str, float], np.ndarray]
 
     def table(self) -> Table:
-        """Where objects were placed, and where they were found."""
+        """Distances at which objects were placed and found."""
         rows = [
             (name, f"{o.distance_mm:g}", o.found_mm, o.error_percent, o.axial_resolution_mm)
             for name, o in self.objects.items()

@@ -225,7 +225,7 @@ def _captures_in(folder: Path, sources: Sources) -> list[Path]:
 
 
 def _images(path: Path, output: Output) -> tuple[Path, ...]:
-    """The image files of a result that is asked for as `path`."""
+    """The image files of a result for the output `path`."""
     suffix = path.suffix.lower()
     if suffix in LINEAR:
         return (path,)

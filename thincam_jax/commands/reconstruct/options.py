@@ -178,7 +178,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Output:
-    """Where and how results are written.
+    """Files and formats of the results.
 
     - `path`: an image file; or a folder, in which each result has the name of its capture.
     - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.

@@ -48,7 +48,7 @@ _SIZE = quantity("mm", positive=True, optional=True)
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Captures that a plan is asked for.
+    """Captures requested of a plan.
 
     - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
       `profile`, `phase`: width, profile and phase of all of them.

@@ -318,7 +318,7 @@ def cells_seen(
 
 @dataclass(frozen=True)
 class MonitorPose:
-    """Where a monitor stands, beside the middle of the object's plane.
+    """Pose of a monitor about the middle of the object's plane.
 
     - `x`, `y`, `z`: place of its middle, mm; z is away from the camera.
     - `rotation`: clockwise as seen; `turn`: its right side, `tilt`: its lower side is farther.

@@ -27,7 +27,7 @@ _MARGIN = 8
 
 
 class Stand(eqx.Module):
-    """Where the planes of a stack stand, one of them at a commanded distance.
+    """Distances of the planes of a stack, one of them at a commanded distance.
 
     - `inverse`: 1/t, 1/mm, the nearest first; `number`: index of the commanded plane.
     - `place`: 1 where a plane stands among the places relative to the commanded one, which is the
