@@ -9,7 +9,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def pytest_benchmark_update_json(config, benchmarks, output_json: dict[str, Any]) -> None:
-    """Of `--benchmark-json`: medians over the fastest of each group, and nothing of the host."""
+    """Add each median over the fastest of its group; leave single timings and the host out."""
     medians = defaultdict(list)
     for one in output_json["benchmarks"]:
         one["stats"].pop("data", None)

@@ -133,21 +133,6 @@ class TrainingScores:
 
 
 @dataclass(frozen=True)
-class FreeNumber:
-    """A free number of a design found; see `FreeValue`."""
-
-    variable: str
-    shots: tuple[int, ...]
-    value: float
-    tolerance: float | None
-    unit: str
-
-    def __str__(self) -> str:
-        """The value with its tolerance."""
-        return str(FreeValue(self.variable, (), self.value, self.tolerance))
-
-
-@dataclass(frozen=True)
 class Candidate(WithShots):
     """A design with the values of its objective: as searched, exact, and exact as reported.
 
@@ -164,7 +149,7 @@ class Candidate(WithShots):
     training_error: float | None = None
     predicted_gain: float | None = None
     training_gain_db: float | None = None
-    values: tuple[FreeNumber, ...] = ()
+    values: tuple[FreeValue, ...] = ()
     status: str = ""
     active_limits: tuple[str, ...] = ()
 
