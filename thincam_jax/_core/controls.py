@@ -14,7 +14,7 @@ from thincam_jax._core import checks
 class Control:
     """A number that is turned.
 
-    - `name`: name of what it sets; `label`, `unit`: words that are shown.
+    - `name`: name of the number; `label`, `unit`: words that are shown.
     - `low`, `high`, `value`: in the shown unit. `scale`: units of the package of one shown unit.
     """
 
@@ -79,7 +79,7 @@ class Controlled(Protocol):
         """Set controls; ValueError where one does not exist, or is out of its range."""
 
     def view(self, *, rest: bool = True) -> View:
-        """The pictures of the setting; at rest, or where a live one is to be kept, all of them."""
+        """The pictures of the setting; at rest, or to keep a live one, all of them."""
         ...
 
 

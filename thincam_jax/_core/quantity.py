@@ -147,7 +147,7 @@ def choice(options: Iterable[str], *, optional: bool = False, many: bool = False
 
 
 def unchecked(unit: str = "", parts: Mapping[str, Quantity] | None = None) -> Quantity:
-    """The unit of what a computation made, or the parts of a dictionary."""
+    """The unit of a computed number, or of the parts of a dictionary."""
     return Quantity(unit, None, parts=parts or {})
 
 

@@ -26,7 +26,7 @@ class Kind:
     - `build`, `run`: functions. For `thincam run`: makes objects of the configuration, and runs
       these into a folder; its result has a `table`. For `thincam train`: makes the lessons, and
       trains in a folder.
-    - `room`: the one of `ROOMS` that it belongs to, if any.
+    - `room`: its room, one of `ROOMS`, if any.
     """
 
     noun: str

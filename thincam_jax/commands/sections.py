@@ -50,7 +50,7 @@ class ObjectConfig(Section):
 class MovingObjectConfig(ObjectConfig):
     """Targets that may move.
 
-    - `motion`: how far across (+x) during an exposure of the sensor's own time. A method's captures
+    - `motion`: motion across (+x) during an exposure of the sensor's own time. A method's captures
       follow each other without a pause, and half way through them the targets are on the axis.
     """
 

@@ -28,7 +28,7 @@ class Landscape:
     - `variables`: their names and shots (none for the width); `axes`: their values, in the
       package's units.
     - `costs`: (n,) or (n, n), the first variable along the first axis; NaN where there is none.
-    - `objective`: that they are costs of.
+    - `objective`: objective of the costs.
     """
 
     variables: tuple[tuple[str, tuple[int, ...]], ...]
@@ -73,7 +73,7 @@ class Landscape:
         """A map of two numbers, or a line over one, with labelled axes.
 
         - `designs`: marked in it, by their names in the legend; the first is the reference.
-        - `costs`: where they are drawn over a single number; by default on the line.
+        - `costs`: heights at which designs are drawn over a single number; by default on the line.
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
         from thincam_jax.plot.frame import new_figure

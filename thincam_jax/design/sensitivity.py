@@ -31,7 +31,7 @@ _ONE_PERCENT = 0.01
 class FreeValue:
     """A free number of a design, in the package's unit.
 
-    - `shots`: that it belongs to, from 1; none for the width, which all share.
+    - `shots`: shots with this number, from 1; none for the width, which all share.
     - `tolerance`: the change that makes the objective worse by 1 %; None where none does.
     """
 

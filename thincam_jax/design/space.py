@@ -76,7 +76,7 @@ class Variable:
 
     - `name`: name of one of the numbers of `Design`; `DesignSpace` refuses any other.
     - `lower`, `upper`: its bounds, in the design's units.
-    - `captures`: which captures share it; for the width, which all share, nothing.
+    - `captures`: numbers of the captures that share it; none for the width, which all share.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Limits:
     - `mask_pixel`: pixel of the display or printer, mm: the zones at the mask's edge keep a period
       of two of them, β·width ≤ π/mask_pixel.
     - `thickness`: the longest distance of mask and sensor, mm.
-    - `captures`: how many at most.
+    - `captures`: largest number of captures.
     - `exposure`: exposure of all captures together, shares: what the free ones leave is divided
       among the others as their own shares are.
     """

@@ -1,4 +1,4 @@
-"""Captures of a study and their reconstructions: agreement with the scene, and what is resolved."""
+"""Captures of a study and their reconstructions: agreement with the scene, and resolution."""
 
 import functools
 import math

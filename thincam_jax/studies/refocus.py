@@ -94,7 +94,7 @@ class PlacedTarget(Target):
 
 @dataclass(frozen=True)
 class FocusRange:
-    """The distances of a sweep of the focus, and what is called sharp.
+    """The distances of a sweep of the focus, and its measure of sharpness.
 
     - `method`: by name, that the sweep reconstructs with.
     - `nearest`, `farthest`: mm; `count`: number of distances, evenly spaced in 1/t.

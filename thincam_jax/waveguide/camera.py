@@ -42,7 +42,7 @@ class Screen(Module):
 
     - `hologram`: on the front surface before the camera and on the rear surface before the object.
     - `glass_thickness`: w, mm. `glass_index`: index of the plate.
-    - `top`, `bottom`: where the holograms are, mm from the camera's axis; None: everywhere.
+    - `top`, `bottom`: extents of the holograms, mm from the camera's axis; None: everywhere.
     """
 
     hologram: VolumeHologram = eqx.field(

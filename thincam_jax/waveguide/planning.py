@@ -48,7 +48,7 @@ class ScreenPlan:
 
     Print it for a table. It holds for images like the one that it was made for.
 
-    - `camera`, `plane` (or a tuple of planes): that it was made for.
+    - `camera`, `plane` (or a tuple of planes): subjects of the plan.
     - `tolerance`, `predicted_error`: relative L2 of the noise-free capture.
     - `orders`: ghosts that are modelled, of `all_orders` that can meet the object.
     - `samples`: parts of the band of each pixel and order; None: the Bragg wavelength alone.

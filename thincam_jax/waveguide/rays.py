@@ -73,7 +73,7 @@ def trace(
 
     - `pixels`: (y, x) on the sensor, mm from its middle: (*pixel, 2).
     - `object_distance`: d2, from the plate's front surface, mm; of several planes by `jax.vmap`.
-    - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
+    - `orders`: number of ghosts, i = 0 … orders − 1, of 2i total reflections each.
     - `extent`: limits of the object, (y, x) mm from the camera's axis; None is infinite.
 
     The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg

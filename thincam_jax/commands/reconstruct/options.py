@@ -92,7 +92,7 @@ class Recipe:
     - `method`: one of `PSF_METHODS`.
     - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most;
       None: as many as the method has by default.
-    - `coupling`: how colours share edges; None: "joint" for several channels.
+    - `coupling`: coupling of the colours' edges; None: "joint" for several channels.
     - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
       light to it.
     - `flip`: turn the image by 180°.

@@ -344,7 +344,7 @@ def check_files(
 ) -> tuple[list[str], bool]:
     """The lines that report `check_psf` of two files, and whether the PSF fits.
 
-    - `out`: where the refined PSF is written, on the pixels of the files.
+    - `out`: file for the refined PSF, on the pixels of the files.
     """
     if out is not None and out.suffix.lower() not in LINEAR:
         raise measured.MeasurementError(f"--refine {out}: give a file .npy or .tif")

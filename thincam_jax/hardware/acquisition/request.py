@@ -180,7 +180,7 @@ class PlanRequest:
 
         - `stage_zero`: distance at the stage's position 0, mm.
         - `shown`: levels of the pictures on the cells, uint8, by name.
-        - `mask`: where there are no `betas`.
+        - `mask`: mask of plans without `betas`.
         """
         dark = {"dark_frames": self.dark_frames}
         if self.kind == "alignment":

@@ -77,7 +77,7 @@ class RigFrames:
     - `frames`: counts without the mean of so many `dark_frames`.
     - `pixels`: part of the sensor that was read, rows and columns.
     - `lit`: pixels of that part that see light.
-    - `variance`: where the frames are means of several; infinite where a pixel is not known.
+    - `variance`: variance of frames that are means of several; infinite for unknown pixels.
     - `bayer`: pattern of the frames; None of grey ones.
     """
 

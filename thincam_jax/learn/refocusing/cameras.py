@@ -51,7 +51,7 @@ class Stand(eqx.Module):
 
 @checked
 class RefocusCamera(eqx.Module):
-    """A camera, its light, its image and the range of distances on which it is to be focused.
+    """A camera, its light, its image and the range of its distances.
 
     - `camera`: mask, sensor and the distance d between them.
     - `light`: a `Spectrum` or one wavelength in mm.

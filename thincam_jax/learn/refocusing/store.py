@@ -82,7 +82,7 @@ def _as_trained(name: str, there: dict[str, Any], cameras) -> RefocusCamera:
 
 
 def _optical(camera: Any) -> Any:
-    """A description without what a sensor makes of the light."""
+    """A description without the sensor's exposure, full well and bits."""
     if not isinstance(camera, dict):
         return camera
     return {name: _optical(value) for name, value in camera.items() if name not in _ELECTRONIC}

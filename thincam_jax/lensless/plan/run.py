@@ -121,7 +121,7 @@ class CapturePlan:
     it was made for and images like its, and for cameras within 1 % of its own, at any phase of the
     mask.
 
-    - `camera`: that it was made for.
+    - `camera`: camera of the plan.
     - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
       batch as a whole.
     - `method`: model of the PSFs with its settings, which `psf` takes.
