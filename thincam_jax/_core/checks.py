@@ -419,3 +419,10 @@ def shape2d(name: str, value: Any) -> tuple[int, int]:
             f"at most {_LARGEST_SIDE}"
         )
     return rows, columns
+
+
+def instance(name: str, kind: type, wanted: str, given: Any) -> Any:
+    """An object of a class; `wanted` is the advice of the TypeError for any other."""
+    if not isinstance(given, kind):
+        raise TypeError(f"{name} is a {type(given).__name__}; give {wanted}")
+    return given

@@ -34,7 +34,7 @@ def encode_srgb(light: np.ndarray) -> np.ndarray:
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """An image (y, x, …) as it is to be seen, of the one that is stored with an orientation."""
+    """An image (y, x, …) turned upright from the orientation in which it is stored."""
     if orientation in (5, 6, 7, 8):
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):

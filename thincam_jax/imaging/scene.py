@@ -156,6 +156,11 @@ class Spectrum(Module):
         if not checks.is_traced(self.weights) and (np.asarray(self.weights) < 0).any():
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
+    @property
+    def colours(self) -> list[tuple[Float[Array, ""], Float[Array, ""]]]:
+        """Pairs of wavelength, mm, and weight."""
+        return list(zip(self.wavelengths, self.weights, strict=True))
+
     def filtered(self, wavelengths: Numbers, transmission: Numbers) -> "Spectrum":
         """This light behind a colour filter, such as one of a sensor's three.
 

@@ -43,7 +43,7 @@ Given = Numbers | Sequence[float | int]
 class Exposure:
     """One exposure, in plain numbers: equal ones are taken once for all methods.
 
-    The fields are those of `Exposures`.
+    The attributes are those of `Exposures`.
     """
 
     beta: Plain

@@ -310,9 +310,9 @@ def _computed(
 ):
     """`function` of what `resolve` gives, in the camera's precision."""
     *numbers, method = resolve(camera, path, model, pixel_integration)
-    with allow(method.float_type, *numbers):
-        result = function(*numbers, method)
     own = precision_of(camera.sensor.pitch)
+    with allow(method.precision or own, *numbers):
+        result = function(*numbers, method)
     return result if method.precision == own else cast(result, own)
 
 

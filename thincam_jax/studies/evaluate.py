@@ -1,4 +1,4 @@
-"""Captures of a study and their reconstructions: agreement with the scene, and what is resolved."""
+"""Captures of a study and their reconstructions: agreement with the scene, and resolution."""
 
 import functools
 import math
@@ -20,7 +20,7 @@ from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
-from thincam_jax.imaging.scene import ImagePlane, Scene
+from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import electrons_per_unit, read_out
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless import forward
@@ -46,14 +46,12 @@ class Capture:
     variance: np.ndarray
 
 
-def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
-    """Light on the sensor, (*channel, y, x), without saturation."""
-    scene, pixels = Scene(planes, exposure.wavelength), study.pixel_integration
+def noise_free(study: Study, exposure: Exposure, *planes: ImagePlane) -> Array:
+    """Light of the planes on the sensor, (*channel, y, x), without saturation."""
+    light, pixels = Spectrum(exposure.wavelength), study.pixel_integration
     method = PsfMethod(study.model, None, pixels, field_tolerance=study.field_tolerance)
-    images = (
-        forward.expose(study.camera(exposure), plane, scene.spectrum, method)
-        for plane in scene.planes
-    )
+    camera = study.camera(exposure)
+    images = (forward.expose(camera, plane, light, method) for plane in planes)
     return functools.reduce(operator.add, images)
 
 

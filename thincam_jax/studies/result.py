@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ResponseLimits:
-    """Where a response has its first zero crossing (None: it has none) and where it ends."""
+    """Frequencies of a response's first zero crossing, None without one, and of its end."""
 
     first_zero_cycles_per_mm: float | None
     first_zero_object_mm: float | None
