@@ -149,7 +149,7 @@ class Spectrum(Module):
         count = wavelengths.size
         self.wavelengths = checks.wavelengths("wavelengths", wavelengths)
         if weights is None:
-            weights = jnp.full(count, 1 / max(count, 1), self.wavelengths.dtype)
+            weights = np.full(count, 1 / max(count, 1), self.wavelengths.dtype)
         self.weights = checks.finite("weights", weights, "parts of one", shape=(count,))
         if count == 0:
             raise ValueError("wavelengths is empty; give at least one wavelength in mm")

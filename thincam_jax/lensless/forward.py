@@ -54,7 +54,7 @@ def imaging_operator(
     arguments are those of `psf`. With a method's `field_tolerance` it is a `field_operator`.
     """
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
-    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
+    colours = list(zip(*map(checks.each, (spectrum.wavelengths, spectrum.weights)), strict=True))
     method = as_method(model, pixel_integration)
     return operator_of(camera, colours, object_distance, field_shape, method)
 
