@@ -113,7 +113,7 @@ def png_bytes(pixels: np.ndarray, gamma: float | int | None = None) -> bytes:
     buffer, info = io.BytesIO(), PIL.PngImagePlugin.PngInfo()
     if gamma is not None:
         info.add(b"gAMA", struct.pack(">I", min(max(round(1e5 / gamma), 1), 2**31 - 1)))
-    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info)
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info, compress_level=3)
     return buffer.getvalue()
 
 

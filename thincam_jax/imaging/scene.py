@@ -149,7 +149,7 @@ class Spectrum(Module):
         count = wavelengths.size
         self.wavelengths = checks.wavelengths("wavelengths", wavelengths)
         if weights is None:
-            weights = jnp.full(count, 1 / max(count, 1), self.wavelengths.dtype)
+            weights = np.full(count, 1 / max(count, 1), self.wavelengths.dtype)
         self.weights = checks.finite("weights", weights, "parts of one", shape=(count,))
         if count == 0:
             raise ValueError("wavelengths is empty; give at least one wavelength in mm")
@@ -159,7 +159,7 @@ class Spectrum(Module):
     @property
     def colours(self) -> list[tuple[Float[Array, ""], Float[Array, ""]]]:
         """Pairs of wavelength, mm, and weight."""
-        return list(zip(self.wavelengths, self.weights, strict=True))
+        return list(zip(*map(checks.each, (self.wavelengths, self.weights)), strict=True))
 
     def filtered(self, wavelengths: Numbers, transmission: Numbers) -> "Spectrum":
         """This light behind a colour filter, such as one of a sensor's three.

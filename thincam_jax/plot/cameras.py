@@ -48,7 +48,9 @@ def draw_psf(figure: matplotlib.figure.Figure, image: np.ndarray, grid: Grid, ti
     whole, line = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.6)})
     shown = show_image(whole, image, float(grid.pitch))
     figure.colorbar(shown, ax=whole, label="irradiance / open aperture")
-    line.plot(np.asarray(grid.x), image[image.shape[0] // 2], color="black", linewidth=0.7)
+    rows, columns = image.shape
+    x = float(grid.pitch) * (np.arange(columns) - (columns - 1) / 2)
+    line.plot(x, image[rows // 2], color="black", linewidth=0.7)
     line.set(xlabel="x (mm), through the middle", ylabel="irradiance / open aperture")
     line.yaxis.set(label_position="right", ticks_position="right")  # away from the other scale
     line.set_title(title, fontsize=9)

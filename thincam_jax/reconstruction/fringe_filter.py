@@ -19,7 +19,7 @@ from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
-from thincam_jax.reconstruction.wiener import require_cameras, require_captures
+from thincam_jax.reconstruction.wiener import each_image, require_cameras, require_captures
 
 
 class FringeFilter(eqx.Module):
@@ -60,10 +60,9 @@ class FringeFilter(eqx.Module):
         rows, columns = (s + max(s, f) for s, f in sizes)
         padded = fast_shape((rows, columns))
         object_distance = checks.positive("object_distance", cameras.object_distance, "mm")
-        magnification = 1 + camera.distance / object_distance
-        grid = Grid(padded, sensor.pitch)
-        self.inverse = _inverse_filter(grid, beta, magnification, camera.mask.centre)
-        self.weights = jnp.asarray(weights, self.inverse.dtype)
+        grid, ratio = Grid(padded, sensor.pitch), (camera.distance, object_distance)
+        self.inverse = _inverse_filter(grid, beta, ratio, camera.mask.centre)
+        self.weights = checks.as_array(weights.astype(self.inverse.dtype))
         self.light = cameras.light(self.field_shape).astype(sensor.pitch.dtype)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
 
@@ -72,9 +71,8 @@ class FringeFilter(eqx.Module):
         captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
         require_captures(captures, (len(self.weights), *self.sensor_shape))
         count, *batch, rows, columns = captures.shape
-        flat = captures.reshape(count, -1, rows, columns)
-        images = [self._image(flat[:, i]) for i in range(flat.shape[1])]
-        image = jnp.stack(images).reshape(*batch, *self.field_shape)
+        image = each_image(self._image, captures.reshape(count, -1, rows, columns))
+        image = image.reshape(*batch, *self.field_shape)
         return Reconstruction(image, self.object_pitch, "fringe_scanning")
 
     @eqx.filter_jit
@@ -123,8 +121,10 @@ class FringeScanning(AbstractSolver):
 
 
 @jax.jit
-def _inverse_filter(grid: Grid, beta, magnification, centre) -> Complex[Array, "v u"]:
+def _inverse_filter(grid: Grid, beta, distances, centre) -> Complex[Array, "v u"]:
     """(β'/π)·exp(−jπ²ρ²/β') where the window samples it, zero elsewhere."""
+    distance, object_distance = distances
+    magnification = 1 + distance / object_distance
     beta = beta / magnification**2
     v, u = jnp.fft.ifftshift(grid.v)[:, None], jnp.fft.ifftshift(grid.u)
     sampled = (jnp.abs(v) < beta * grid.shape[0] * grid.pitch / (2 * jnp.pi)) & (

@@ -62,7 +62,7 @@ def record(
     light = scene.spectrum
     optics = Cameras(
         cameras,
-        wavelength=light if light.wavelengths.size > 1 else light.wavelengths[0],
+        wavelength=light if light.wavelengths.size > 1 else checks.each(light.wavelengths)[0],
         object_distance=distances[0] if len(distances) == 1 else np.unique(distances),
         model=model,
     )
@@ -74,7 +74,7 @@ def record(
     ]
     variances = None
     if isinstance(noise, GaussianNoise) and not checks.holds_traced(captures):
-        variances = [float(np.mean(noise.variance(one))) for one in captures]
+        variances = [float(np.mean(np.asarray(noise.variance(one)))) for one in captures]
     if not checks.holds_traced(scene, cameras):
         covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]
         widest = np.minimum(in_steps(np.max(covers, axis=0).tolist()), optics.seen_field)
