@@ -21,7 +21,7 @@ from thincam_jax.commands.schema import (
 )
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.imaging.targets.images import sample_images
-from thincam_jax.lensless.exposures import PAIR, QUARTERS, Exposures
+from thincam_jax.lensless.exposures import PAIR, QUARTERS, Exposures, Layout
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction import TotalVariation
@@ -116,6 +116,20 @@ class VariationConfig(section(AdmmTV, TotalVariation, **_VARIATION)):
     """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
 
+class MosaicConfig(Section):
+    """Masks side by side on one sensor, exposed together; see `thincam_jax.Mosaic`.
+
+    - `rows`, `columns`: numbers of masks, in the order of shots and their phases, row by row.
+    - `wall`: thickness of black walls between them, 0 mm for thin ones; none by default.
+    - `pitch`: distance of their middles; by default the sensor's sides over their number.
+    """
+
+    rows: Annotated[int, Field(ge=1, le=16)]
+    columns: Annotated[int, Field(ge=1, le=16)]
+    wall: Annotated[Position, Field(ge=0)] | None = None
+    pitch: Length | None = None
+
+
 MethodKind = Literal["fringe_scanning", "wiener", "admm_tv", "pnp"]
 # The mask phases taken at each shot, rad, where the synthesis sets them.
 PHASES = {"fringe_scanning": QUARTERS, "phase_pairs": PAIR}
@@ -124,6 +138,7 @@ PHASES = {"fringe_scanning": QUARTERS, "phase_pairs": PAIR}
 class MethodConfig(Section):
     """A reconstruction and the captures that it takes.
 
+    - `mosaic`: takes all captures in one exposure, each on a part of the sensor.
     - `steps`, `harmonics`: number of phases of a turn that the synthesis harmonics takes at each
       shot, and the m that it keeps.
     """
@@ -136,6 +151,7 @@ class MethodConfig(Section):
     phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
     steps: Annotated[int, Field(ge=3, le=64)] = 8
     harmonics: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    mosaic: MosaicConfig | None = None
     published: PublishedConfig = PublishedConfig()
 
     @pydantic.model_validator(mode="after")
@@ -364,6 +380,11 @@ def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
         take=[shot.take or 1 for shot in shots],
     )
     exposures = settings.at_phases(method.shot_phases())
+    if method.mosaic is not None:
+        try:
+            exposures = exposures.at_once(Layout(**dict(method.mosaic)))
+        except ValueError as error:
+            raise FieldError(str(error), "mosaic") from None
     return exposures.of_moving(config.motion) if config.motion else exposures
 
 

@@ -29,7 +29,7 @@ from thincam_jax._core.precision import (
 from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
-from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
 from thincam_jax.lensless.propagation.geometric import geometric
@@ -309,6 +309,8 @@ def _computed(
     pixel_integration: bool = True,
 ):
     """`function` of what `resolve` gives, in the camera's precision."""
+    if path.at is None and path.place is not None and as_method(model).model in SAMPLED:
+        path = replace(path, at=jnp.zeros_like(path.place))  # these follow the ray
     *numbers, method = resolve(camera, path, model, pixel_integration)
     with allow(method.float_type, *numbers):
         result = function(*numbers, method)
