@@ -116,18 +116,8 @@ class VariationConfig(section(AdmmTV, TotalVariation, **_VARIATION)):
     """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
 
-class MosaicConfig(Section):
-    """Masks side by side on one sensor, exposed together; see `thincam_jax.Mosaic`.
-
-    - `rows`, `columns`: numbers of masks, in the order of shots and their phases, row by row.
-    - `wall`: thickness of black walls between them, 0 mm for thin ones; none by default.
-    - `pitch`: distance of their middles; by default the sensor's sides over their number.
-    """
-
-    rows: Annotated[int, Field(ge=1, le=16)]
-    columns: Annotated[int, Field(ge=1, le=16)]
-    wall: Annotated[Position, Field(ge=0)] | None = None
-    pitch: Length | None = None
+class MosaicConfig(section(Layout)):
+    """Masks side by side on one sensor, exposed together; see `thincam_jax.Mosaic`."""
 
 
 MethodKind = Literal["fringe_scanning", "wiener", "admm_tv", "pnp"]
@@ -382,7 +372,7 @@ def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
     exposures = settings.at_phases(method.shot_phases())
     if method.mosaic is not None:
         try:
-            exposures = exposures.at_once(Layout(**dict(method.mosaic)))
+            exposures = exposures.at_once(method.mosaic.build())
         except ValueError as error:
             raise FieldError(str(error), "mosaic") from None
     return exposures.of_moving(config.motion) if config.motion else exposures

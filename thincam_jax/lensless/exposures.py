@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import decimal_value
-from thincam_jax._core.quantity import quantities, unchecked
+from thincam_jax._core.quantity import check_fields, quantities, quantity, unchecked, whole
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
@@ -49,10 +49,13 @@ class Layout:
       middles, mm; None for the sensor's sides over their number.
     """
 
-    rows: int
-    columns: int
-    wall: float | None = None
-    pitch: float | None = None
+    rows: Annotated[int, whole(1, 16)]
+    columns: Annotated[int, whole(1, 16)]
+    wall: Annotated[float | None, quantity("mm", non_negative=True, optional=True)] = None
+    pitch: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -64,12 +67,16 @@ class MosaicPart:
     layout: Layout
 
     def camera(self, sensor: Sensor, mask: AbstractMask | None) -> LenslessCamera:
-        """The part of the mosaic; arguments as of `Exposures.cameras`."""
+        """The part as a camera; arguments as of `Exposures.cameras`."""
+        return self.mosaic(sensor, mask).cameras[self.number]
+
+    def mosaic(self, sensor: Sensor, mask: AbstractMask | None) -> Mosaic:
+        """All parts; arguments as of `Exposures.cameras`."""
         layout, all_ = self.layout, self.exposures
         masks = [one.mask(mask) for one in all_]
         nearest = min(one.distance for one in all_)
         heights = np.reshape([one.distance - nearest for one in all_], (-1, layout.columns))
-        mosaic = Mosaic(
+        return Mosaic(
             [masks[n : n + layout.columns] for n in range(0, len(masks), layout.columns)],
             all_[0].sensor(sensor),
             nearest,
@@ -77,7 +84,6 @@ class MosaicPart:
             wall=layout.wall,
             spacers=heights if heights.any() else None,
         )
-        return mosaic.cameras[self.number]
 
 
 @dataclass(frozen=True)

@@ -162,6 +162,11 @@ class Mosaic(Module):
         return sizes[0], sizes[1]
 
     @property
+    def placed(self) -> tuple[AbstractMask, ...]:
+        """The masks at their places in the plane, row by row."""
+        return tuple(_moved(m, c) for m, c in zip(self._flat, self._centres, strict=True))
+
+    @property
     def cameras(self) -> tuple[LenslessCamera, ...]:
         """The parts, row by row, as cameras that look at one scene from their places.
 
@@ -253,8 +258,7 @@ class Mosaic(Module):
         return (np.asarray(corner) - free / 2) * self._pixel
 
     def _in_a_plane(self, moved: Any) -> SideBySide:
-        masks = [_moved(m, c) for m, c in zip(self._flat, self._centres, strict=True)]
-        return SideBySide(masks, centre=moved)  # pyright: ignore[reportArgumentType]
+        return SideBySide(self.placed, centre=moved)  # pyright: ignore[reportArgumentType]
 
 
 def _moved(mask: AbstractMask, by: np.ndarray) -> AbstractMask:
