@@ -22,11 +22,12 @@ import jax.numpy as jnp
 import lineax
 import numpy as np
 import optimistix
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
-from thincam_jax._core.precision import as_complex, product, squared_modulus
+from thincam_jax._core.precision import as_complex, product
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -40,7 +41,6 @@ from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.imaging.operators.separable import SeparableModes
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    back_project,
     back_projected,
     convolutions,
     detector_shape,
@@ -56,8 +56,8 @@ INNER_STEPS = 500
 _SPAN, _FEW = 8, 1024
 # In units of the machine's, of the eigenvalues of convolutions, relative to the largest.
 _ROUNDING = 10
-# Least part of a convolution's power that is left where a background takes the uniform light.
-_KEPT = 0.01
+# Steps that find what a background takes: fewer leave the image twice as many, more gain none.
+_BEGINNING = 6
 
 
 class AbstractNormal(eqx.Module):
@@ -122,8 +122,10 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)
     convolved = convolutions(fixed)
-    powers = None if convolved is None else mean_powers(convolved, fixed.weights)
-    return IterativeNormal(problem, shift, powers=powers)
+    if convolved is None:
+        return IterativeNormal(problem, shift)
+    powers, uniform = _nearest(fixed, jax.lax.stop_gradient(shift), convolved)
+    return IterativeNormal(problem, shift, powers=powers, uniform=uniform)
 
 
 class DenseNormal(AbstractNormal):
@@ -206,10 +208,13 @@ class IterativeNormal(AbstractNormal):
 
     Convolutions are preconditioned by their `mean_powers`, separable cameras by the `modes` given.
     Captures that are not `lit` have no background.
+
+    - `uniform`: with backgrounds to find, the `UniformLight` of one plane.
     """
 
     modes: SeparableModes | None = None
     powers: Complex[Array, "channel p q v u"] | None = None
+    uniform: "UniformLight | None" = None
     lit: tuple[Bool[Array, "..."], ...] | None = None
 
     def applied(self, image: Float[Array, "..."]):
@@ -250,9 +255,11 @@ class IterativeNormal(AbstractNormal):
 
     def _filter(self):
         if self.powers is not None:
-            left = self.problem.has_background and self.powers.shape[1] == 1
-            powers = less_uniform(self.problem, self.powers) if left else self.powers
-            return functools.partial(_filtered, replace(self, powers=powers).inverse_filter())
+            nearest = functools.partial(_filtered, self.inverse_filter())
+            if self.uniform is None:
+                return nearest
+            found = self.uniform
+            return lambda image: nearest(image) + found.solved(image, self.shift)
         return self.modes and functools.partial(_by_modes, self.modes, self.shift)
 
     def least_squares(
@@ -315,6 +322,51 @@ class IterativeNormal(AbstractNormal):
         return jnp.moveaxis(inverse, (-2, -1), (1, 2))
 
 
+class UniformLight(eqx.Module):
+    r"""The image d whose light on the sensor is nearest to uniform, which a background takes.
+
+    Without the background d has one of the largest eigenvalues, with it one of the smallest: the
+    step :math:`d\,d^T / d^T(A^TwA + \mu)d` is added to the preconditioner.
+
+    - `image`: d. `power`: ‖√w A d‖² of it without its background.
+    """
+
+    image: Float[Array, "*batch channel 1 y x"]
+    power: Float[Array, "*batch channel 1 1 1"]
+
+    def solved(self, right: Float[Array, "..."], shift: Float[Array, ""]) -> Float[Array, "..."]:
+        """d dᵀb / dᵀ(AᵀwA + μ)d."""
+        size = self.power + shift * _inner(self.image, self.image)
+        return self.image * (_inner(self.image, right) / or_one(size))
+
+
+def _inner(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+    return jnp.sum(a * b, axis=(-3, -2, -1), keepdims=True)
+
+
+@jax.jit
+def _nearest(
+    problem: InverseProblem, shift: Float[Array, ""], operators: tuple[CropConvolution, ...]
+) -> tuple[Complex[Array, "channel p q v u"], UniformLight | None]:
+    """The preconditioner of convolutions: eigenvalues, and what a background takes.
+
+    d = (AᵀwA + μ)⁻¹ Aᵀw1 without backgrounds takes few steps, since its light is strong.
+    """
+    powers = mean_powers(operators, problem.weights)
+    if powers.shape[1] > 1 or not problem.has_background:
+        return powers, None
+    dark = tuple(jnp.zeros((), bool) for _ in operators)
+    known = IterativeNormal(problem, shift, powers=powers, lit=dark)
+    ones = [jnp.ones(operator.out_shape, shift.dtype) for operator in operators]
+    right = back_projected(problem, ones, dark)
+    image, _ = cg(known.applied, right, M=known._filter(), tol=0.0, maxiter=_BEGINNING)
+    seen = [forward(operator, image) for operator in problem.operators]
+    seen = without_background(problem, seen)
+    pairs = zip(problem.weights, seen, strict=True)
+    power = sum(jnp.sum(w * d**2, axis=(-2, -1), keepdims=True) for w, d in pairs)
+    return powers, UniformLight(image, power[..., None, :, :])
+
+
 def _filtered(inverse: Complex[Array, "channel p q v u"], image: Float[Array, "..."]):
     """An image on the window of the filter, filtered, and cut: positive definite."""
     rows, columns = image.shape[-2:]
@@ -358,23 +410,6 @@ def mean_powers(
     least = _ROUNDING * jnp.finfo(folded.dtype).eps * jnp.max(jnp.abs(powers))
     unit = jnp.eye(powers.shape[1], dtype=folded.dtype)[..., None, None]
     return powers + as_complex(least * unit)
-
-
-@jax.jit
-def less_uniform(problem: InverseProblem, powers: Complex[Array, "channel p q v u"]):
-    r"""Eigenvalues without the part of uniform light on the sensor, which is the background's.
-
-    :math:`A^Tw 1 1^TwA / 1^Tw1` of n pixels has the nearest circulant eigenvalues
-    :math:`|F A^T w 1|^2 / (n\, 1^T w 1)`, of one plane.
-    """
-    lost, window = 0.0, padded_field(problem.field_shape)
-    for operator, weight in _weighted(problem):
-        pixels = jnp.mean(weight, axis=tuple(range(weight.ndim - 2)))
-        pixels = jnp.broadcast_to(pixels, operator.out_shape)
-        light = jnp.fft.rfft2(back_project(operator, pixels), s=window)[..., None, :, :]
-        total = jnp.sum(pixels[0]) * math.prod(problem.field_shape)
-        lost = lost + squared_modulus(light) / or_one(total)
-    return jnp.maximum(powers.real - lost, _KEPT * powers.real).astype(powers.dtype)
 
 
 def _folded(lags: Float[Array, "*planes n"], side: int, period: int) -> Float[Array, "*planes m"]:
