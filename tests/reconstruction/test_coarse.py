@@ -10,6 +10,7 @@ import skimage
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax._core.grids import block_mean, block_sum
+from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.targets import resize
 from thincam_jax.reconstruction import InverseProblem
@@ -70,8 +71,12 @@ def test_what_is_too_small_or_no_convolution_has_none():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("dark", [False, True])
-def test_30_iterations_after_coarse_ones_do_what_300_do(dark):
-    """A zone aperture's capture in a bright field, and a random PSF's in the dark, at 30 dB."""
+def test_some_30_iterations_after_coarse_ones_do_what_1000_do(dark):
+    """A zone aperture's capture in a bright field, and a random PSF's in the dark, at 30 dB.
+
+    They end by a change of 1 % of the image. The objective is then up to 2 % above the lowest: a
+    penalty of ADMM that suits the image leaves it noise of less than a hundredth.
+    """
     picture = resize(skimage.img_as_float(skimage.data.camera()), (96, 112))
     if dark:
         pixels = RNG.random((24, 28)) < 0.3
@@ -86,10 +91,14 @@ def test_30_iterations_after_coarse_ones_do_what_300_do(dark):
     capture = capture + capture.std() * 10**-1.5 * RNG.standard_normal(capture.shape)
     recording = tc.Recording(capture.reshape(1, 96, 112), optics)
     default, best = tc.AdmmTV(), tc.AdmmTV(iterations=1000, tolerance=1e-6)
-    lowest = min(p.objective for p in tc.reconstruct(recording, best).history)
+    minimiser = tc.reconstruct(recording, best)
+    lowest = min(p.objective for p in minimiser.history)
     result = tc.reconstruct(recording, default)
-    assert result.status == "converged"
-    assert min(p.objective for p in result.history) < 1.005 * lowest
+    assert result.status == "converged" and result.iterations <= 60
+    assert min(p.objective for p in result.history) < 1.02 * lowest
+    assert relative_l2(result.image, minimiser.image) < 0.015
+    scores = [psnr(np.asarray(one.image), picture) for one in (result, minimiser)]
+    assert scores[0] > scores[1] - 0.03
     # From an image that is given all pixels take their iterations, black as before.
     cold = jnp.full(result.image.shape, 0.0 if dark else 0.5)
     short = dataclasses.replace(default, iterations=30)

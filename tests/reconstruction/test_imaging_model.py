@@ -182,3 +182,15 @@ def test_a_field_in_mm_needs_known_numbers():
 
     with pytest.raises(TypeError, match="give field_shape, or known numbers"):
         jax.jit(pixels_at)(250.0)
+
+
+def test_another_geometry_may_not_hold_the_whole_scene():
+    """What `record` knows of its own field does not hold for one that a user gives."""
+    mask = tc.FresnelZoneAperture(25.0, width=1.0)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    plane = tc.ImagePlane(np.eye(2), distance=250.0, width=80.0)
+    model = tc.record(camera, tc.Scene(plane, 500 * nm)).imaging_model
+    assert model.whole_scene and model.replace(wavelength=600 * nm).whole_scene
+    assert not model.replace(field_shape=(12, 16)).whole_scene
+    assert not model.replace(object_distance=125.0).whole_scene
+    assert model.replace(field_shape=(48, 64), whole_scene=True).whole_scene

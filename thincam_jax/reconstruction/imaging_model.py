@@ -25,6 +25,7 @@ from thincam_jax.lensless.method import MODELS, Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import spectral_psf
 
 _DARK = 0.3  # share of a PSF's absolute sum
+_GEOMETRY = ("cameras", "object_distance", "field_shape", "field_height", "field_width")
 
 
 def _field_shape(given: Any) -> tuple[int, int] | None:
@@ -115,6 +116,12 @@ class Cameras(Module):
                 f"field_shape = {self.field_shape} and field_height or field_width are given; "
                 "give pixels or mm"
             )
+
+    def replace(self, **changes: Any) -> "Cameras":
+        """The cameras with other fields; another geometry may no longer hold the whole scene."""
+        if not changes.keys().isdisjoint(_GEOMETRY):
+            changes = {"whole_scene": False} | changes
+        return super().replace(**changes)
 
     @property
     def count(self) -> int:

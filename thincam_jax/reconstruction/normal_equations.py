@@ -363,8 +363,8 @@ def _nearest(
     seen = [forward(operator, image) for operator in problem.operators]
     seen = without_background(problem, seen)
     pairs = zip(problem.weights, seen, strict=True)
-    power = sum(jnp.sum(w * d**2, axis=(-2, -1), keepdims=True) for w, d in pairs)
-    return powers, UniformLight(image, power[..., None, :, :])
+    squares = [jnp.sum(w * d**2, axis=(-2, -1))[..., None, None, None] for w, d in pairs]
+    return powers, UniformLight(image, sum(squares[1:], start=squares[0]))
 
 
 def _filtered(inverse: Complex[Array, "channel p q v u"], image: Float[Array, "..."]):
