@@ -25,13 +25,18 @@ from thincam_jax.studies import Method, Study, Target
 from thincam_jax.studies.evaluate import evaluate, expose, field_shape, reconstructor, stacked
 from thincam_jax.units import nm, um
 
-SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a narrower sensor, in a minute
+# "half": half the sensor, with total variation; "small": a quarter of it, in a minute.
+SIZE = os.environ.get("THINCAM_SIZE", "full")
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "mosaic"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
 # The sensor of the thesis, 5.632 mm, with pixels of twice its pitch; "small" is a quarter as wide,
 # with zones as fine. Masks of half the width and twice the β have the same band.
-count, seeds, noises = {"full": (512, 3, (30, 40)), "small": (128, 1, (40,))}[SIZE]
+count, seeds, noises = {
+    "full": (512, 3, (30, 40)),
+    "half": (256, 1, (40,)),
+    "small": (128, 1, (40,)),
+}[SIZE]
 part = 512 / count
 light, distance, place = 500 * nm, 6.5, (250.0, 90.0 / part)
 sensor = tc.Sensor((count, count), 11 * um)
@@ -107,8 +112,10 @@ figure.savefig(FIGURES / "psf.png", dpi=110)
 # A part at c sees a point at t displaced by (d/t)·c. Its PSF holds this, so that reconstructions of
 # all parts agree. The same captures, as if all parts stood in one place:
 
-steps = {"full": (40.0, 80.0, 160.0, 320.0), "small": (20.0, 80.0)}[SIZE]
-photographs = {"full": ("camera", "coins", "rocket"), "small": ("camera",)}[SIZE]
+steps = (40.0, 80.0, 160.0, 320.0) if SIZE == "full" else (20.0, 80.0)
+photographs = {"full": ("camera", "coins", "rocket"), "half": ("camera", "coins")}.get(
+    SIZE, ("camera",)
+)
 
 
 def decibels(recording, scene):
@@ -151,7 +158,7 @@ for step in steps:
 # so many pixels of the sensor in it. Method A′ is two β at four phases: eight captures of a half,
 # or eight masks. Halves of the width cost half of the resolution, or take twice the β.
 
-ways = {"full": (0, 4, 8, 16), "small": (0, 8)}[SIZE]
+ways = {"full": (0, 4, 8, 16), "half": (0, 4, 8, 16, 32), "small": (0, 8)}[SIZE]
 shape = {"wavelength": light, "width": 5.632 / part}
 parts_of = {"wavelength": light, "width": small, "relative_time": 4}
 four, eight = Layout(2, 2, wall), Layout(2, 4, wall)
@@ -176,7 +183,17 @@ targets = [
     *(replace(Target.photograph(n, *place), number=i) for i, n in enumerate(photographs, 1)),
 ]
 print("captures:", {method.name: len(method.exposures) for method in methods})
-methods = methods if SIZE == "full" else methods[:2]
+tv = tc.AdmmTV(0.3, iterations=60)
+if SIZE != "full":
+    methods = methods[:2]
+if SIZE == "half":
+    short = tc.Exposures(beta, distance, **parts_of | {"relative_time": 1}).fringe_scanned()
+    methods += (
+        Method("4 captures, TV", scanned, tv, "fringe_scanning"),
+        Method("mosaic of 4, TV", own, tv, "fringe_scanning"),
+        Method("short mosaic, TV", short.at_once(four), tv, "fringe_scanning"),
+    )
+still = [method for method in methods if "A′" in method.name]
 
 
 def electrons(snr_db):
@@ -208,13 +225,13 @@ def moving(method, pixels):
 
 # The PSF of each exposure, and the filter of each method, are computed once.
 study, found = studies[noises[0]], {}
-for number, method in enumerate(methods):
+for method in methods:
     shape = field_shape(study, method, targets[0])
     solve = reconstructor(study, method, shape, 250.0)
     cameras = [study.camera(exposure) for exposure in method.exposures]
     field = in_steps(projected_shape(cameras[0], targets[0].plane))
     optics = [imaging_operator(one, light, 250.0, field_shape=field) for one in cameras]
-    for pixels in ways if number < 4 else ways[:1]:
+    for pixels in ways[:1] if method in still else ways:
         ends = [exposure.moves for exposure in moving(method, pixels)]
         for target in targets:
             planes = [replace(target.plane, moves=one) for one in ends]
@@ -251,7 +268,7 @@ def lines(snr, pixels, name):
 
 for snr in noises:
     for method in methods:
-        gone = ways if method in methods[:4] else ways[:1]
+        gone = ways[:1] if method in still else ways
         means = [psnrs(snr, pixels, method.name).mean() for pixels in gone]
         spread = psnrs(snr, 0, method.name)
         print(
@@ -263,20 +280,20 @@ for snr in noises:
 
 # %%
 figure, axes = plt.subplots(1, len(noises), figsize=(4 + 4 * len(noises), 4.2), sharey=True)
-shades = {"4 captures": "0.0", "mosaic of 4": "0.0", "method B": "C1"}
 for ax, snr in zip(np.atleast_1d(axes), noises, strict=True):
-    for method in methods[:4]:
-        color = next(c for start, c in reversed(shades.items()) if method.name.startswith(start))
-        style = "-" if "mosaic" in method.name else "--"
+    for method in methods:
+        if method in still:
+            continue
+        color = "C0" if "TV" in method.name else "C1" if "B" in method.name else "0.0"
+        style = ":" if "short" in method.name else "-" if "mosaic" in method.name else "--"
+        marker = {":": "^", "-": "o", "--": "s"}[style]
         means = [psnrs(snr, pixels, method.name).mean() for pixels in ways]
-        ax.plot(
-            ways, means, style, color=color, marker="o" if style == "-" else "s", label=method.name
-        )
+        ax.plot(ways, means, style, color=color, marker=marker, label=method.name)
     ax.set_xscale("symlog", base=2, linthresh=1)
     ax.set_xticks(ways, [str(pixels) for pixels in ways])
     ax.set(title=f"{snr} dB on the whole sensor", xlabel="pixels moved in the whole time")
     ax.grid(alpha=0.3)
-np.atleast_1d(axes)[0].set_ylabel("PSNR (dB), mean of three photographs")
+np.atleast_1d(axes)[0].set_ylabel(f"PSNR (dB), mean of {len(photographs)} photographs")
 np.atleast_1d(axes)[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 figure.tight_layout()
 figure.savefig(FIGURES / "speeds.png", dpi=110)
@@ -323,7 +340,7 @@ figure.savefig(FIGURES / "walls.png", dpi=110)
 # Two β and two heights of spacers, for pairs of phases (method B): the expected error of the Wiener
 # filter, 1/(1/η_f + Σ|H|²/η) averaged over frequencies, for a scene of spectrum η_f ∝ 1/f².
 
-fine = {"full": 256, "small": 64}[SIZE]
+fine = 64 if SIZE == "small" else 256
 alone = tc.Sensor((fine, fine), 11 * um)
 rho2 = np.asarray(alone.grid.v)[:, None] ** 2 + np.asarray(alone.grid.u) ** 2
 scene_power = 3e3 / (rho2 + (2 / (fine * 11 * um)) ** 2)
