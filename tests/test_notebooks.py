@@ -21,8 +21,8 @@ def cells_of(script: str) -> list[str]:
     return re.split(r"^# %%.*\n(?:#.*\n)*", text, flags=re.MULTILINE)
 
 
-def pictures_of(cells: list[str], folder, monkeypatch) -> list[str]:
-    """PNG pictures that a notebook shows, of which nothing else is on stderr."""
+def outputs_of(cells: list[str], folder, monkeypatch) -> list[dict[str, str]]:
+    """What a notebook shows, by type; nothing is on stderr."""
     for name in ("MPLBACKEND", "JAX_PLATFORMS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
@@ -34,11 +34,17 @@ def pictures_of(cells: list[str], folder, monkeypatch) -> list[str]:
     nbclient.NotebookClient(book, timeout=600, kernel_name="python3", resources=where).execute()
     outputs = [output for cell in book.cells for output in cell.outputs]
     assert not [o.text for o in outputs if o.get("name") == "stderr"]
-    return [o.data["image/png"] for o in outputs if "image/png" in o.get("data", {})]
+    return [dict(o.get("data", {})) for o in outputs]
+
+
+def pictures_of(cells: list[str], folder, monkeypatch) -> list[str]:
+    """PNG pictures that a notebook shows."""
+    shown = outputs_of(cells, folder, monkeypatch)
+    return [o["image/png"] for o in shown if "image/png" in o]
 
 
 def test_first_image_with_an_own_mask_and_photograph(tmp_path, monkeypatch):
-    """The block of the Start page, of at most twelve lines."""
+    """The block of the Start page, of at most twelve lines; its lines of progress are gone."""
     page = (ROOT / "docs/start.md").read_text("utf-8").split("## First image")[1]
     block = page.split("```python\n")[1].split("```")[0]
     assert len([line for line in block.splitlines() if line]) <= 12
@@ -47,7 +53,9 @@ def test_first_image_with_an_own_mask_and_photograph(tmp_path, monkeypatch):
     mask = PIL.Image.fromarray(np.kron(255 * cells, np.ones((10, 10), np.uint8)))
     mask.save(tmp_path / "mask.png")
     assert mask.size == (400, 400)
-    assert len(pictures_of([f"{block}figure"], tmp_path, monkeypatch)) == 1
+    shown = outputs_of([f"{block}figure"], tmp_path, monkeypatch)
+    assert sum("image/png" in one for one in shown) == 1
+    assert {"text/plain": ""} in shown
 
 
 @pytest.mark.parametrize("script", ["in_a_notebook", "real_capture"])

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 # Seconds until the first line, between two that are seen, and between two of a log.
 _PATIENCE, _OFTEN, _SELDOM = 1.0, 0.5, 10.0
@@ -21,9 +22,9 @@ def watched(what: str) -> Iterator[Callable[[int, int], None]]:
     """Show `what` goes on while it does; also a decorator.
 
     Yields a function of the step done and the most that there can be. Nothing is shown of what
-    takes less than a second, or within another watched call. At a terminal and in a notebook the
-    line is written to stderr and goes at the end, elsewhere it is logged every ten seconds, as
-    information. THINCAM_PROGRESS=off in the environment ends it.
+    takes less than a second, or within another watched call. At a terminal the line is written to
+    stderr, in a notebook below its cell, and goes at the end; elsewhere it is logged every ten
+    seconds, as information. THINCAM_PROGRESS=off in the environment ends it.
     """
     if _is_watched.get() or os.environ.get("THINCAM_PROGRESS") == "off":
         yield lambda step, most: None
@@ -64,7 +65,8 @@ class _Line:
         self.first: tuple[int, float] | None = None
         self.now = (0, 0)
         self.stream, self.width = sys.stderr, 0
-        self.is_live = self.stream.isatty() or _in_notebook()
+        self.notebook, self.output = _notebook(), None
+        self.is_live = self.stream.isatty() or self.notebook is not None
 
     def tell(self, step: int, most: int) -> None:
         self.now = (step, most)
@@ -80,7 +82,11 @@ class _Line:
 
     def show(self, text: str) -> None:
         """Write the text over the one before; nothing over nothing."""
-        if text or self.width:
+        if self.notebook and (text or self.output):
+            show = self.output.update if self.output else self.notebook.display
+            other = {} if self.output else {"display_id": True}
+            self.output = show({"text/plain": text}, raw=True, **other) or self.output
+        elif text or self.width:
             line = "\r" + text.ljust(self.width) + ("" if text else "\r")
             with contextlib.suppress(OSError, ValueError):  # of a stream that was closed
                 self.stream.write(line)
@@ -99,6 +105,7 @@ class _Line:
         return f"{text}, at most {left:.0f} s left"
 
 
-def _in_notebook() -> bool:
+def _notebook() -> Any:
+    """IPython's module of outputs, in a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return hasattr(shell, "kernel")
+    return sys.modules["IPython"].display if hasattr(shell, "kernel") else None
