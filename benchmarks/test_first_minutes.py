@@ -57,13 +57,11 @@ LINES = (
     """
 import thincam_jax as tc
 from thincam_jax.units import nm, um
-from skimage import data
-import numpy as np, PIL.Image, tempfile
+import importlib.util, numpy as np
 """
     + METER
     + """
-photo = tempfile.mkdtemp() + "/photo.png"
-PIL.Image.fromarray(data.astronaut()).save(photo)
+photo = importlib.util.find_spec("skimage").submodule_search_locations[0] + "/data/astronaut.png"
 def image(solver, beta=25.0, d=6.5, distance=250.0, light=550 * nm):
     mask, sensor = tc.FresnelZoneAperture(beta=beta, width=5.6), tc.Sensor((512, 512), 11 * um)
     camera = tc.LenslessCamera(mask, sensor, distance=d)

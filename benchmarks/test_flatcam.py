@@ -13,7 +13,7 @@ import numpy as np
 
 import thincam_jax as tc
 from thincam_jax.imaging.operators import Separable
-from thincam_jax.lensless.masks.redundant_arrays import maximum_length_sequence
+from thincam_jax.lensless.masks.cells import maximum_length_sequence
 from thincam_jax.reconstruction.ridge import ridge_by_modes
 
 SENSOR, FIELD, CHANNELS, RHO = (500, 620), (256, 256), 4, 1e-3

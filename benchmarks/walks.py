@@ -1,5 +1,7 @@
 """Count the files that a call leads through: `python benchmarks/walks.py [--files] [WALK ...]`.
 
+Without names it counts all, and writes them into the table of docs/measured/walks.md.
+
 A reader follows a call as the interpreter does, but reads each function once, where it is first
 called. Functions that follow each other in one file are one stay there; coming back to a file that
 was left is a return. Compiled programs are forgotten before, so that what is traced is read, too.
@@ -21,6 +23,7 @@ import thincam_jax as tc
 from thincam_jax.units import nm, um
 
 PACKAGE = Path(tc.__file__).parent
+PAGE = Path(__file__).parents[1] / "docs/measured/walks.md"
 LEFT_OUT = ("_core/", "__init__.py")
 
 
@@ -121,7 +124,9 @@ def main() -> None:
     parser.add_argument("walks", nargs="*", help=", ".join(one.__name__ for one in WALKS))
     parser.add_argument("--files", action="store_true", help="print the files in their order")
     asked = parser.parse_args()
-    for one in WALKS:
+    page = PAGE.read_text("utf-8").splitlines()
+    first = next(n for n, line in enumerate(page) if line.startswith("|---")) + 1
+    for row, one in enumerate(WALKS, first):
         if asked.walks and one.__name__ not in asked.walks:
             continue
         call = one()
@@ -129,6 +134,10 @@ def main() -> None:
         print(f"{one.__name__}: {found}; without what is resolved before: {beside}")
         if asked.files:
             print("  " + " ".join(beside.stays))
+        counts = (f"{w.files}, {len(w.stays)}, {w.returns}" for w in (found, beside))
+        page[row] = "|".join((*page[row].split("|")[:3], *(f" {text} " for text in counts), ""))
+    if not asked.walks:
+        PAGE.write_text("\n".join(page) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

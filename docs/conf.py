@@ -121,7 +121,7 @@ MODULES = (
     "learn.refocusing.scenes",
     "learn.refocusing.sources",
     "learn.refocusing.train",
-    "learn.refocusing.use",
+    "learn.refocusing.learned",
     "learn.training",
     "lensless.exposures",
     "lensless.forward",

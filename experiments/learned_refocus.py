@@ -25,11 +25,11 @@ import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.learned import read
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import SceneOptions, draw_batch
 from thincam_jax.learn.refocusing.sources import drawn
 from thincam_jax.learn.refocusing.train import Lessons, train
-from thincam_jax.learn.refocusing.use import read
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.reconstruction.depth import refocus_distances
 from thincam_jax.units import nm, um

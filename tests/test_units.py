@@ -5,6 +5,7 @@ import math
 import pint
 import pytest
 
+from thincam_jax import units
 from thincam_jax.units import deg, mrad, nm, parse_quantity, um
 
 
@@ -65,6 +66,14 @@ def test_angle_is_in_radians(text, value):
 )
 def test_curvature_is_in_radians_per_square_millimetre(text, value):
     assert parse_quantity(text, "curvature") == pytest.approx(value, rel=1e-14, abs=0)
+
+
+def test_units_that_files_have_most_are_those_of_pint():
+    """To the last bit; they are read without it."""
+    for kind, names in units._COMMON.items():
+        for unit in names:
+            by_pint = parse_quantity(f"61.2{unit}", kind)  # without a blank
+            assert parse_quantity(f"61.2 {unit}", kind) == by_pint
 
 
 def test_quantity_of_any_registry_is_accepted():

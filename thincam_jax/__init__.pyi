@@ -20,22 +20,20 @@ from .imaging.sensor import PoissonGaussianNoise as PoissonGaussianNoise
 from .imaging.sensor import Sensor as Sensor
 from .imaging.targets.images import load_image as load_image
 from .learn.plug_and_play import PlugAndPlay as PlugAndPlay
-from .learn.refocusing.use import Learned as Learned
+from .learn.refocusing.learned import Learned as Learned
 from .lensless.accuracy.select import choose_model as choose_model
 from .lensless.accuracy.select import predict_error as predict_error
 from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.exposures import Exposures as Exposures
 from .lensless.field import field_operator as field_operator
+from .lensless.masks.cells import ModifiedUniformlyRedundantArray as ModifiedUniformlyRedundantArray
+from .lensless.masks.cells import SeparableMask as SeparableMask
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
+from .lensless.masks.openings import LensletArray as LensletArray
+from .lensless.masks.openings import Pinhole as Pinhole
+from .lensless.masks.openings import RadialMask as RadialMask
 from .lensless.masks.phase import PhaseMask as PhaseMask
-from .lensless.masks.pinhole import LensletArray as LensletArray
-from .lensless.masks.pinhole import Pinhole as Pinhole
-from .lensless.masks.pinhole import RadialMask as RadialMask
-from .lensless.masks.redundant_arrays import (
-    ModifiedUniformlyRedundantArray as ModifiedUniformlyRedundantArray,
-)
-from .lensless.masks.redundant_arrays import SeparableMask as SeparableMask
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import PsfMethod as PsfMethod

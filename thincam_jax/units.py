@@ -88,6 +88,15 @@ KINDS = {
     ),
 }
 
+# Units that files have most, each in the package's: pint takes half a second to start.
+_COMMON = {
+    "length": {"nm": nm, "um": um, "mm": mm, "m": m},
+    "wavelength": {"nm": nm, "um": um},
+    "angle": {"deg": deg, "mrad": mrad, "rad": rad},
+    "curvature": {"rad/mm^2": 1.0},
+    "time": {"ms": 1e-3, "s": 1.0},
+}
+
 # What a quantity of another kind is called, by its root units as pint writes them.
 _NAMES = {
     "dimensionless": "a pure number",
@@ -157,6 +166,9 @@ def parse_quantity(text: object, kind: str) -> float:
         text = " ".join(text.split())
         if len(text) > _LONGEST:
             raise ValueError(f'"{text[:_LONGEST]}…" is not {wanted.name}: {wanted.advice}')
+        number, _, unit = text.partition(" ")
+        if unit in _COMMON[kind] and _NUMBER.fullmatch(number) and math.isfinite(float(number)):
+            return float(number) * _COMMON[kind][unit]
         shown = f'"{text}"'
         quantity = _read(text, wanted)
     elif hasattr(text, "magnitude") and hasattr(text, "to_root_units"):

@@ -17,12 +17,12 @@ from refocusing_scores import scores
 
 import thincam_jax as tc
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.learned import read
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.scenes import SceneOptions, draw_batch
 from thincam_jax.learn.refocusing.sources import drawn
 from thincam_jax.learn.refocusing.train import Lessons, examples, loss, relative_error, train
-from thincam_jax.learn.refocusing.use import read
 from thincam_jax.learn.training import Task, TrainingOptions, train_model
 from thincam_jax.units import nm, um
 

@@ -134,6 +134,15 @@ def test_elsewhere_it_is_logged(at_terminal, monkeypatch, caplog):
     assert not at_terminal.getvalue()
 
 
+def test_a_psf_is_watched(at_terminal):
+    """Of a size that no other test has: it is compiled, with what is said then."""
+    mask = tc.FresnelZoneAperture(beta=25.0, width=1.6, profile="binary", harmonics=3)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 260), 0.02), distance=5.0)
+    with contextlib.redirect_stderr(at_terminal):
+        tc.psf(camera, wavelength=5e-4)
+    assert re.search(r"computing the PSF, \d+ s: compiling", at_terminal.getvalue())
+
+
 def test_a_reconstruction_is_watched(at_terminal):
     """With its iterations; a callback of the user's sees them, too, and stops it."""
     psf = np.random.default_rng(0).random((9, 9))

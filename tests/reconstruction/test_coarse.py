@@ -104,3 +104,21 @@ def test_some_30_iterations_after_coarse_ones_do_what_1000_do(dark):
     short = dataclasses.replace(default, iterations=30)
     begun = tc.reconstruct(recording, short, start=cold).history[-1].objective
     assert tc.reconstruct(recording, short).history[-1].objective - lowest < (begun - lowest) / 3
+
+
+def test_smooth_misfit_does_not_end_the_iterations_at_the_coarse_image():
+    """2 % of shading, a zone aperture's strong uniform light: the objective rises at first."""
+    picture = resize(skimage.img_as_float(skimage.data.camera()), (96, 98))
+    camera = tc.LenslessCamera(
+        tc.FresnelZoneAperture(25.0, width=5.6), tc.Sensor((192, 196), 0.029), 6.5
+    )
+    optics = tc.Cameras([camera], wavelength=5e-4, object_distance=250.0, field_shape=(96, 98))
+    blank = tc.Recording(np.zeros((1, 192, 196)), optics, noise_variance=1.0)
+    (light,) = np.asarray(blank.problem().operators[0](jnp.asarray(picture)[None, None]))
+    y, x = np.meshgrid(np.linspace(-1, 1, 192), np.linspace(-1, 1, 196), indexing="ij")
+    shading = 0.02 * (np.sin(1.7 * y + 0.3) + 0.7 * np.cos(2.9 * x - 1))
+    noise = light.std() * 10**-1.5 * np.random.default_rng(0).standard_normal(light.shape)
+    result = tc.reconstruct(tc.Recording([light * (1 + shading) + noise], optics), tc.AdmmTV())
+    first, *objectives = [p.objective for p in result.history]
+    assert result.status == "converged" and max(objectives) > first
+    assert min(objectives) < 0.99 * first

@@ -99,3 +99,30 @@ def test_a_mosaic_is_recorded_in_one_frame():
             truth = seen.planes[0].sample(grid, magnification=1.0)
             found.append(tc.imaging.metrics.psnr(np.asarray(image), np.asarray(truth)))
         assert found[0] > found[1] + 1.0
+
+
+FOUR = [ZONES[0].replace(mask=ZONES[0].mask.replace(phase=n * 90 * deg)) for n in range(4)]
+MURA = tc.LenslessCamera(tc.ModifiedUniformlyRedundantArray(11, 120 * um), SENSOR, distance=3.0)
+COLOURS = np.stack([PICTURE, PICTURE[::-1], PICTURE[:, ::-1]])
+MOVED = tc.ImagePlane(PICTURE, 250.0, 120.0, moves=(0.0, 4.0))
+WHITE = tc.Spectrum([480 * nm, 540 * nm, 600 * nm])
+KINDS = {
+    "colours": (ZONES[0], tc.Scene(tc.ImagePlane(COLOURS, 250.0, 120.0), 550 * nm)),
+    "four phases": (FOUR, scene()),
+    "MURA": (MURA, scene()),
+    "own mask": (CAMERA, scene()),
+    "moving": (CAMERA, tc.Scene(MOVED, 550 * nm)),
+    "polychromatic": (ZONES[0], scene(spectrum=WHITE)),
+    "two distances": (ZONES[::2], scene()),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", KINDS)
+def test_three_lines_of_each_kind_give_an_image_of_the_scene(kind):
+    camera, seen = KINDS[kind]
+    recording = tc.record(camera, seen, noise=40.0)
+    result = tc.reconstruct(recording)
+    assert result._repr_png_().startswith(b"\x89PNG")
+    truth = seen.planes[0].sample(tc.Grid(result.image.shape[-2:], result.pitch), magnification=1.0)
+    assert np.corrcoef(np.ravel(result.image), np.ravel(truth))[0, 1] > 0.75

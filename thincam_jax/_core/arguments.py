@@ -100,7 +100,7 @@ def refuse_unsound(names: Iterable[str], args: tuple[Any, ...], kwargs: dict[str
 
 
 def _settled(value: Any) -> Any:
-    """Modules, alone or in lists, with the plain numbers that `equinox.tree_at` put into fields.
+    """Modules, alone or in lists, with the plain numbers that `equinox.tree_at` put in.
 
     They become arrays, and are checked, as when the module is made.
     """

@@ -194,7 +194,7 @@ class CaptureStore:
             self.group["digests"][:] = digests
 
     def tidy(self, numbers: Iterable[int]) -> None:
-        """Remove what a killed process left half written in the chunks of frames."""
+        """Remove frames that a killed process left half written in their chunks."""
         for chunk in sorted({number // self.together for number in numbers}):
             for partial in (self._chunks / str(chunk)).rglob("*.partial"):
                 partial.unlink()

@@ -181,6 +181,18 @@ def as_array(value: Any, *, floating: bool = False) -> Array:
     return jax.lax.convert_element_type(array, array.dtype)
 
 
+def each(array: Any, axis: int = 0) -> list[Any]:
+    """Parts of an array along an axis; of a known one in NumPy, where nothing is compiled."""
+    return list((array if holds_traced(array) else np.asarray(array)).swapaxes(0, axis))
+
+
+def stacked(parts: Sequence[Any]) -> Array:
+    """A stack of arrays of one shape; of known ones in NumPy, where nothing is compiled."""
+    if holds_traced(parts):
+        return jnp.stack(parts)
+    return as_array(np.stack([np.asarray(part) for part in parts]))
+
+
 def _require(array: Checked, holds: Callable[[np.ndarray], Any], message: str) -> Checked:
     """The array, or ValueError with its value in the message; a traced one passes."""
     known = _known(array)
@@ -419,3 +431,10 @@ def shape2d(name: str, value: Any) -> tuple[int, int]:
             f"at most {_LARGEST_SIDE}"
         )
     return rows, columns
+
+
+def instance(name: str, kind: type, wanted: str, given: Any) -> Any:
+    """An object of a class; `wanted` is the advice of the TypeError for any other."""
+    if not isinstance(given, kind):
+        raise TypeError(f"{name} is a {type(given).__name__}; give {wanted}")
+    return given

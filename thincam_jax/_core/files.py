@@ -42,7 +42,7 @@ class WriteError(OSError):
 
 @contextlib.contextmanager
 def writing(path: str | os.PathLike[str]) -> Iterator[None]:
-    """WriteError, one line with this path, for what the system refuses within."""
+    """WriteError, one line with this path, for refusals of the system within."""
     try:
         yield
     except OSError as error:

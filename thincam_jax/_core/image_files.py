@@ -96,7 +96,7 @@ def npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _npy_size(file: Any) -> tuple[int, int]:
-    """Number of values and bytes, before NumPy allocates what a damaged header announces."""
+    """Number of values and bytes by the header, before NumPy allocates them."""
     shape, dtype = npy_header(file)
     begin, count = file.tell(), math.prod(int(n) for n in shape)
     size, held = dtype.itemsize * count, file.seek(0, os.SEEK_END) - begin

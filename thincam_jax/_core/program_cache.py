@@ -24,7 +24,7 @@ _SETTINGS = {
 
 
 def cache_folder() -> Path:
-    """Where the programs are: in the platform's folder for what can be made again."""
+    """Folder of the programs, below the platform's cache folder."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local"
     elif sys.platform == "darwin":

@@ -1,4 +1,4 @@
-"""A line for who waits: what a long call is doing, since when, and how long at most."""
+"""A line of progress: the work of a long call, its time, and the time left at most."""
 
 import contextlib
 import contextvars

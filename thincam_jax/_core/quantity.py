@@ -3,7 +3,7 @@
     beta: Float[Array, ""] = eqx.field(converter=quantity("rad/mm^2", positive=True))
 
 The quantity checks what is given; printers, readers of files, options, labels of axes and tables
-ask it for the unit. A parameter without a field has it in its annotation,
+ask it for the unit. A parameter without an attribute has it in its annotation,
 `Annotated[Number, quantity("mm", positive=True)]`.
 """
 
@@ -28,7 +28,7 @@ _LENGTHS = ((1.0, "mm", 0.1), (1e-3, "µm", 1e-3), (1e-6, "nm", 0.0))
 
 
 class FieldError(ValueError):
-    """A fault between fields: `field` is the one to change, `place` the way to an entry of it."""
+    """A fault between keys: `field` is the one to change, `place` the way to an entry of it."""
 
     def __init__(self, message: str, field: str, *entry: str | int):
         super().__init__(message)
@@ -37,7 +37,7 @@ class FieldError(ValueError):
 
 @dataclass(eq=False)
 class Quantity:
-    """One number or choice, made by `quantity` or `choice`; called, it is the field's converter.
+    """One number or choice, made by `quantity` or `choice`: the converter of an attribute.
 
     - `unit`: one of `UNITS`, or words for messages.
     - `check`: function of a name and a value: the value to keep, or ValueError or TypeError in one
@@ -147,12 +147,12 @@ def choice(options: Iterable[str], *, optional: bool = False, many: bool = False
 
 
 def unchecked(unit: str = "", parts: Mapping[str, Quantity] | None = None) -> Quantity:
-    """The unit of what a computation made, or the parts of a dictionary."""
+    """The unit of a computed number, or of the parts of a dictionary."""
     return Quantity(unit, None, parts=parts or {})
 
 
 def quantities(*owners: Any) -> dict[str, Quantity]:
-    """The quantities of the fields of classes and of the parameters of functions, by name."""
+    """Quantities of the attributes of a class or the parameters of a function, by name."""
     found: dict[str, Quantity] = {}
     for owner in owners:
         if dataclasses.is_dataclass(owner):
@@ -165,7 +165,7 @@ def quantities(*owners: Any) -> dict[str, Quantity]:
 
 
 def check_fields(record: Any) -> None:
-    """Check the fields of a plain record by the quantities of their annotations."""
+    """Check the attributes of a plain record by the quantities of their annotations."""
     with checks.on_host():
         for name, one in quantities(type(record)).items():
             one(getattr(record, name))

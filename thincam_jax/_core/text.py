@@ -34,3 +34,8 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
     plain = {re.sub(r"[\W_]", "", one).casefold(): one for one in known}
     given = re.sub(r"[\W_]", "", name).casefold()
     return [plain[one] for one in difflib.get_close_matches(given, plain)]
+
+
+def slug(name: str) -> str:
+    """A name as a file name."""
+    return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-._") or "unnamed"

@@ -40,7 +40,7 @@ def load_as(
 
 
 def check_as(model: type[Config], places: Places) -> Config:
-    """Check raw data; a fault names the setting that asked for it, else the place in the file."""
+    """Check raw data; a fault names the option that set the entry, else the place in the file."""
     try:
         return model.model_validate(places.raw)
     except pydantic.ValidationError as error:

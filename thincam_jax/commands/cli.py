@@ -111,7 +111,7 @@ app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None, cls=InOrder
 )
 # The callback keeps the name of a single command.
-calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
+calibrate = typer.Typer(no_args_is_help=True, help="Check a calibration by captures.")
 calibrate.callback()(lambda: None)
 for group, command, *examples in (
     (app, init, "init study", "init design --sensor 1500x2000 --pitch 3.45um --out mine.yaml"),
@@ -177,13 +177,15 @@ def options(
 @app.command()
 @with_output
 def doctor(
-    devices: Annotated[bool, typer.Option(help="What is connected, by looking alone.")] = False,
-    ask: Annotated[str | None, typer.Option(help="A serial port to ask what it is.")] = None,
+    devices: Annotated[
+        bool, typer.Option(help="List connected devices, without opening any.")
+    ] = False,
+    ask: Annotated[str | None, typer.Option(help="Serial port to ask for its device.")] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Versions, precisions and drivers, too.")
+        bool, typer.Option("--all", help="List versions, precisions and drivers, too.")
     ] = False,
 ) -> None:
-    """Say what can be done here and what is missing."""
+    """Show what works here and what is missing."""
     with reported(lambda: "interrupted"):
         from thincam_jax._core.environment import machine_report, package_report, verdict
 

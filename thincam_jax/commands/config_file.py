@@ -1,6 +1,5 @@
 """The text of an experiment file: YAML read with the lines of its entries, values set by path."""
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class Places:
-    """Where the entries of raw data come from, which makes no difference to what they are.
+    """Origin of the entries of raw data; it makes no difference to their values.
 
     - `lines`: file and line, by location; `asked`: the options that set an entry, by location.
     - `top`: the place of what has none.
@@ -160,7 +159,7 @@ def path_keys(path: str) -> tuple[str | int, ...] | None:
 
 
 def set_entry(raw: Any, keys: tuple, value: Any, asked: str) -> None:
-    """Set the entry at a path; `asked` is how the user asked for it, for the message."""
+    """Set the entry at a path; `asked`: the user's words, for the message."""
     here: Any = raw
     for depth, key in enumerate(keys):
         known = (isinstance(here, list) and isinstance(key, int) and key < len(here)) or isinstance(
@@ -176,7 +175,7 @@ def set_entry(raw: Any, keys: tuple, value: Any, asked: str) -> None:
 
 
 def read_value(text: str, asked: str) -> Any:
-    """A value as YAML has it; `asked` is how the user asked for it, for the message."""
+    """A value as YAML has it; `asked`: the user's words, for the message."""
     try:
         return _read_yaml(text)[1]
     except TooLargeError as error:
@@ -184,8 +183,3 @@ def read_value(text: str, asked: str) -> Any:
     except (yaml.YAMLError, ValueError):
         given = shortened(repr(text))
         raise ConfigError(f"{asked}: {given} is not valid YAML; put texts in quotes") from None
-
-
-def slug(name: str) -> str:
-    """A name as a file name."""
-    return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-._") or "unnamed"

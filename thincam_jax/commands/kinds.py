@@ -26,7 +26,7 @@ class Kind:
     - `build`, `run`: functions. For `thincam run`: makes objects of the configuration, and runs
       these into a folder; its result has a `table`. For `thincam train`: makes the lessons, and
       trains in a folder.
-    - `room`: the one of `ROOMS` that it belongs to, if any.
+    - `room`: its room, one of `ROOMS`, if any.
     """
 
     noun: str
@@ -191,15 +191,23 @@ def _source(example: str) -> Path:
 
 def init(
     example: Annotated[
-        str | None, typer.Argument(help="Leave it out for a list of them.", autocompletion=examples)
+        str | None,
+        typer.Argument(
+            help="Name of an example. Without it, all are listed.", autocompletion=examples
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File, or folder; default EXAMPLE.yaml.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="File or folder to write to. Default: EXAMPLE.yaml.")
+    ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="Pixels of your sensor, as 1500x2000; for 'design'.")
+        str | None,
+        typer.Option(help="Pixels of your sensor, such as 1500x2000; with 'design' only."),
     ] = None,
-    pitch: Annotated[str | None, typer.Option(help="Its pixel pitch, as 3.45um.")] = None,
+    pitch: Annotated[
+        str | None, typer.Option(help="Pixel pitch of your sensor, such as 3.45um.")
+    ] = None,
 ) -> None:
-    """Write an example experiment file to begin with; or list these."""
+    """Write an example experiment file, or list all."""
     with reported(lambda: "interrupted"):
         import yaml
 

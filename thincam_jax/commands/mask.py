@@ -17,15 +17,15 @@ from thincam_jax.lensless import masks
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.masks.display import on_display
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask, diffuser, voronoi_fresnel
-from thincam_jax.lensless.masks.pinhole import LensletArray, Pinhole
-from thincam_jax.lensless.masks.redundant_arrays import (
+from thincam_jax.lensless.masks.cells import (
     Combination,
     ModifiedUniformlyRedundantArray,
     SeparableMask,
 )
+from thincam_jax.lensless.masks.display import on_display
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.masks.openings import LensletArray, Pinhole
+from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask, diffuser, voronoi_fresnel
 from thincam_jax.lensless.masks.sampled import SampledMask, read_mask
 
 APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")

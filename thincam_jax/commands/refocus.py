@@ -7,7 +7,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.config_file import slug
+from thincam_jax._core.text import slug
 from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.schema import section

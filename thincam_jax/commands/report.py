@@ -15,8 +15,8 @@ import PIL.Image
 
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.table import Table
+from thincam_jax._core.text import slug
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.sections import CamerasConfig
 
 
@@ -106,7 +106,7 @@ def render_report(
 ) -> str:
     """A page as HTML, with the experiment's configuration and how it was computed at its end.
 
-    - `folder`: that of the page, and `figures`: that of its figures therein.
+    - `folder`: folder of the page; `figures`: folder of its figures therein.
     - `environment`: environment of the run, by `_core.environment.environment`.
 
     Texts are escaped; a name that is missing is an error.

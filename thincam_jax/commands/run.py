@@ -27,15 +27,15 @@ from thincam_jax.commands.terminal import (
 def run(
     config: ConfigFile,
     out: Annotated[
-        Path | None, typer.Option(help="Run folder; default runs/NAME of the study.")
+        Path | None, typer.Option(help="Folder of the results. Default: runs/NAME.")
     ] = None,
     set_: Overrides = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Simulate an experiment and reconstruct it; or reconstruct a store of 'thincam capture'.
+    """Simulate and reconstruct an experiment.
 
-    Writes images, metrics.json, figures and report.html. Ctrl-C keeps what is finished; the same
-    command goes on from there.
+    Also reconstructs a store of 'thincam capture'. Writes images, metrics.json, figures and
+    report.html. Ctrl-C keeps what is finished; the same command goes on from there.
     """
     asked: Any = None
     folder: Any = None
@@ -76,9 +76,9 @@ def run(
 
 
 def design(
-    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind design.")],
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind 'design'.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
+        Path | None, typer.Option(help="Folder of the results. Default: runs/NAME.")
     ] = None,
     set_: Overrides = None,
     dry_run: DryRun = False,
@@ -109,10 +109,16 @@ def design(
 
 def schema(
     kind: Annotated[
-        str, typer.Argument(help=f"One of {', '.join(KINDS)}.", autocompletion=lambda: list(KINDS))
+        str,
+        typer.Argument(
+            help=f"Kind of file: {', '.join(KINDS)}.", autocompletion=lambda: list(KINDS)
+        ),
     ],
 ) -> None:
-    """Print the JSON Schema of a kind of experiment file, with which editors complete and check."""
+    """Print the JSON Schema of a kind of file.
+
+    Editors complete and check experiment files with it.
+    """
     with reported(lambda: "interrupted"):
         import json
 
@@ -125,10 +131,11 @@ def schema(
 
 
 def explain(config: ConfigFile, set_: Overrides = None) -> None:
-    """Print every value of an experiment file with its unit and where it comes from.
+    """Print the values of an experiment file.
 
-    Also what a run computes: error, memory and operations of PSFs, rays of a screen, evaluations of
-    a search, frames of a capture, steps of a training.
+    Each with its unit and its line, or "default"; and the work of a run: error, memory and
+    operations of PSFs, rays of a screen, evaluations of a search, frames of a capture, steps of a
+    training.
     """
     with reported(lambda: "interrupted"):
         asked = load_experiment(config, tuple(set_ or ()), command=None)
@@ -185,8 +192,8 @@ def costs(asked: Any, setup: Any = None) -> Iterator[str]:
     return kind.part(kind.costs)(asked, setup)
 
 
-Port = Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one.")]
-Browser = Annotated[bool, typer.Option(help="Open the page.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")]
+Browser = Annotated[bool, typer.Option(help="Open the page in a browser.")]
 
 
 def serve_page(shown: Any, title: str, port: int, browser: bool) -> None:
@@ -207,9 +214,10 @@ def serve_page(shown: Any, title: str, port: int, browser: bool) -> None:
 def explore(
     config: ConfigFile, set_: Overrides = None, port: Port = 0, browser: Browser = True
 ) -> None:
-    """Turn the numbers of a study's first camera, on a page in the browser.
+    """Change a camera's numbers and see its PSF.
 
-    Only this machine reaches it, and only with the address that is printed. Ctrl-C ends it.
+    Opens a page in the browser with the first camera of a study. Only this machine reaches it, and
+    only with the address that is printed. Ctrl-C ends it.
     """
     with reported(lambda: "interrupted"):
         from thincam_jax.commands.kinds import load_study

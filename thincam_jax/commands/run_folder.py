@@ -17,8 +17,9 @@ from thincam_jax._core.environment import environment, installed
 from thincam_jax._core.files import WriteError, file_digest, read_json, read_regular, write_whole
 from thincam_jax._core.precision import is_double
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.text import slug
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sections import ExperimentConfig
@@ -54,7 +55,7 @@ class RunFolder:
 
     @classmethod
     def chosen(cls: type[Folder], out: Path | None, name: str, config: Section) -> Folder:
-        """The folder asked for, or runs/NAME; where that is another's, runs/NAME-2 and so on."""
+        """The folder given, or runs/NAME; if another run has that, runs/NAME-2 and so on."""
         first, number = out or Path("runs") / slug(name), 1
         folder = cls(first)
         while out is None and not folder._is_open_to(config):

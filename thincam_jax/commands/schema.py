@@ -54,7 +54,7 @@ class ObjectSection(Section):
     """A section with the parameters of constructors.
 
     - `parameters`: all of its keys; `makers`: the constructors, each with its own.
-    - `complete`: those that need no more than the section has.
+    - `complete`: constructors that need no more than the section has.
     """
 
     parameters: ClassVar[tuple[str, ...]] = ()
@@ -91,8 +91,9 @@ def section(
 ) -> Any:
     """A class whose keys are the parameters of constructors.
 
-    - `only`, `without`: which parameters the file has, or has not.
-    - `defaults`: where a file has others than the constructor. None: the key may be left out.
+    - `only`, `without`: parameters that the file has, or has not.
+    - `defaults`: defaults of the file that differ from the constructor's. None: the key may be left
+      out.
     """
     fields: dict[str, Any] = {}
     keys: dict[Any, tuple[str, ...]] = {}

@@ -8,7 +8,8 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.config_file import ConfigError, Places, slug
+from thincam_jax._core.text import slug
+from thincam_jax.commands.config_file import ConfigError, Places
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.schema import (
     Angle,
@@ -40,7 +41,7 @@ class SensorConfig(section(Sensor)):
 
 
 class ObjectConfig(Section):
-    """Where the targets stand and how wide they are."""
+    """Distance and width of the targets."""
 
     distance: Length
     width: Length
@@ -49,7 +50,7 @@ class ObjectConfig(Section):
 class MovingObjectConfig(ObjectConfig):
     """Targets that may move.
 
-    - `motion`: how far across (+x) during an exposure of the sensor's own time. A method's captures
+    - `motion`: motion across (+x) during an exposure of the sensor's own time. A method's captures
       follow each other without a pause, and half way through them the targets are on the axis.
     """
 
@@ -305,7 +306,7 @@ class StudyConfig(CamerasConfig):
 
 
 def check_known(name: str, what: str, names: Sequence[str], *place: Any) -> None:
-    """Refuse a name that is none of those of a list."""
+    """Refuse a name that a list does not have."""
     if name not in names:
         raise FieldError(f"{name!r} is no {what}; choose one of {', '.join(names)}", *place)
 
@@ -345,13 +346,14 @@ def _check_family(config: CamerasConfig) -> None:
 
 def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
     """A method of a file, with all of its exposures."""
-    published = method.published
+    published, phases = method.published, method.shot_phases()
+    solver = build_solver(method.kind, method.variation, config.prior)
     return Method(
         method.name,
         exposures_of(config, method),
-        build_solver(method.kind, method.variation, config.prior),
+        solver,
         method.synthesis,
-        len(method.shot_phases()),
+        len(phases),
         method.harmonics,
         Published(published.psnr_db, published.resolved, published.limit_cycles_per_mm),
     )
@@ -359,7 +361,7 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
 
 def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
     """Each shot of a method at each of its phases; one after another where the object moves."""
-    shots = method.shots
+    shots, phases = method.shots, method.shot_phases()
     settings = Exposures(
         [shot.beta or 0.0 for shot in shots],  # 0: of a mask without zones
         [shot.distance for shot in shots],
@@ -369,7 +371,7 @@ def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
         profile=[shot.profile for shot in shots],
         take=[shot.take or 1 for shot in shots],
     )
-    exposures = settings.at_phases(method.shot_phases())
+    exposures = settings.at_phases(phases)
     if method.mosaic is not None:
         try:
             exposures = exposures.at_once(method.mosaic.build())

@@ -3,6 +3,7 @@
 Imported before anything else, hence it imports next to nothing itself.
 """
 
+import gc
 import io
 import os
 import sys
@@ -12,6 +13,8 @@ from thincam_jax.commands.terminal import end_on_interrupt
 
 def main() -> None:
     """Run the command `thincam`."""
+    # Imports and tracing make many objects and little garbage: looking for it took a tenth.
+    gc.set_threshold(50_000, 20, 100)
     end_on_interrupt()
     while (unused := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass  # a stream that was closed at the start: its number is no file's to come

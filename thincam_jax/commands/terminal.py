@@ -75,13 +75,17 @@ WRONG_INPUT = 2
 output: Literal["text", "json", "nothing"] = "text"
 _MOST_LINES, _HALF = 10, 500  # of an error; characters of each half of a line that is cut
 
-ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); thincam init makes one.")]
+ConfigFile = Annotated[
+    Path, typer.Argument(help="Experiment file (YAML); 'thincam init' writes one.")
+]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
+    typer.Option(
+        "--set", help="Change a value of the file: a.b=value; entries of lists by number, from 0."
+    ),
 ]
 DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Check all and tell what would be done, without doing it.")
+    bool, typer.Option("--dry-run", help="Check everything and list the work, without doing it.")
 ]
 
 
@@ -117,7 +121,7 @@ def reported(interrupted: Callable[[], str]) -> Iterator[None]:
 
 
 def _no_memory(error: BaseException) -> bool:
-    """Whether Python or XLA could not have what they asked for; the texts of either say nothing."""
+    """Whether Python or XLA ran out of memory and says nothing of use."""
     return str(error).startswith("RESOURCE_EXHAUSTED") or (
         isinstance(error, MemoryError) and not str(error)
     )

@@ -28,7 +28,7 @@ class Landscape:
     - `variables`: their names and shots (none for the width); `axes`: their values, in the
       package's units.
     - `costs`: (n,) or (n, n), the first variable along the first axis; NaN where there is none.
-    - `objective`: that they are costs of.
+    - `objective`: objective of the costs.
     """
 
     variables: tuple[tuple[str, tuple[int, ...]], ...]
@@ -55,7 +55,7 @@ class Landscape:
         return np.asarray(costs, dtype=float)
 
     def place(self, design: Design) -> tuple[float, ...]:
-        """Where a design lies on the axes, in the units of the plot."""
+        """Place of a design on the axes, in the units of the plot."""
         firsts = [(own[0] - 1) * design.phases if own else 0 for _, own in self.variables]
         return tuple(
             float(np.asarray(getattr(design, name), dtype=float).ravel()[first])
@@ -73,11 +73,11 @@ class Landscape:
         """A map of two numbers, or a line over one, with labelled axes.
 
         - `designs`: marked in it, by their names in the legend; the first is the reference.
-        - `costs`: where they are drawn over a single number; by default on the line.
+        - `costs`: heights at which designs are drawn over a single number; by default on the line.
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
-        from thincam_jax.plot.cameras import draw_landscape
         from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.objectives import draw_landscape
 
         ax = new_figure(7.6, 6.0).subplots() if ax is None else ax
         draw_landscape(self, ax, designs or {}, costs or {})

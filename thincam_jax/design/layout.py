@@ -14,7 +14,7 @@ from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax._core.quantity import choice, quantity, whole
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.masks.pinhole import RadialMask
+from thincam_jax.lensless.masks.openings import RadialMask
 from thincam_jax.lensless.mosaic import Mosaic
 
 Tone = Literal["open", "opaque"]

@@ -121,7 +121,7 @@ class ResponseModel(eqx.Module):
 
 
 def checked_levels(target: Numbers, rings: int, dtype: DTypeLike) -> Float[Array, " ring"]:
-    """Wanted levels, looked at where they are known: ValueError, one line, for what is none."""
+    """Wanted levels, checked if they are known: ValueError, one line, for others."""
     if checks.is_traced(target):
         levels = jnp.asarray(target).astype(dtype)
     else:
@@ -138,7 +138,7 @@ def checked_levels(target: Numbers, rings: int, dtype: DTypeLike) -> Float[Array
                 ring = int(np.argmax(bad))
                 raise ValueError(
                     f"target level of ring {ring + 1} is {known[ring]:g}, {what}; give levels "
-                    "10·log10(1 + ratio) of at least 0 dB, and 0 where nothing is asked for"
+                    "10·log10(1 + ratio) of at least 0 dB, and 0 where none is wanted"
                 )
     return levels
 
@@ -186,7 +186,7 @@ class Match(Module):
       was looked at has a response.
     - `evaluations`: number of evaluations of the response, with or without its derivatives, samples
       included.
-    - `failed`: how many samples and descents met a response that is not finite.
+    - `failed`: number of samples and descents that met a response that is not finite.
     """
 
     found: tuple[Found, ...]

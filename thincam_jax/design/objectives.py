@@ -56,7 +56,7 @@ class Channels(eqx.Module):
 
     @property
     def signal_to_noise(self) -> Float[Array, "*point"]:
-        """η_f J: what is known of a frequency over what is not."""
+        """η_f J: signal over noise of a frequency."""
         return self.density * self.information
 
 

@@ -35,7 +35,7 @@ PLATEAU_DB = 0.1
 class SensorDesign:
     """Design found for a sensor, beside the thesis' pair and a random search of equal cost.
 
-    - `problem`: the one searched, for `sensitivity_around` and the other functions of problems.
+    - `problem`: its problem, for `sensitivity_around` and the other functions of problems.
     - `best`: the design found, with its numbers in `values`; `random`: the best of `evaluations`
       random ones.
     - `errors_db`: expected errors of `best`, the thesis' pair and `random`, see `BayesError`.

@@ -1,4 +1,4 @@
-r"""The relief of a phase mask by gradient: what it may be, what it is judged by, and the descent.
+r"""The relief of a phase mask by gradient: its limits, its objective, and the descent.
 
 A phase retrieved for one wavelength, rounded to the levels that can be made, is no longer the best
 one. Here the heights themselves are changed, with the limits inside: each is
@@ -58,7 +58,7 @@ _STAGES = (0.0, 0.4, 0.7, 0.9, 1.0)
 # Of a field, whose full matrices take their square: 2048 are 16 MB and some seconds a step.
 _MOST_SAMPLES = 2048
 
-# (mask, data, key) → what is to be small.
+# (mask, data, key) → cost.
 MaskObjective = Callable[[PhaseMask, Any, PRNGKeyArray], Float[Array, ""]]
 
 
@@ -145,7 +145,7 @@ def contour_mask(
 
 @checked
 class MaskSetting(eqx.Module):
-    """Where a mask is designed: its sensor, and the light that it meets.
+    """Setting of a mask's design: its sensor, and the light that it meets.
 
     - `sensor`, `distance`: mask to sensor, mm. `wavelengths`, `object_distances`: mm.
     - `together`: the sensor sees all wavelengths as one grey image; else each has its own.

@@ -180,7 +180,7 @@ def _unit(setup: Setup, frequencies: Frequencies) -> Float[Array, ""]:
 
 
 def capture_light(design: Design, setup: Setup) -> Float[Array, " capture"]:
-    """Mean of each capture of a scene of mean 1, mm²: what the object's shadow lets through."""
+    """Mean of each capture of a scene of mean 1, mm²: light through the object's shadow."""
     shadow = design.width * (1 + design.distance / setup.object_distance)
     return _evenness(design) * jnp.minimum(shadow, setup.field * design.distance) ** 2
 

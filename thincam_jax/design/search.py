@@ -67,7 +67,7 @@ class NonFiniteObjectiveError(ValueError):
 
 
 class Descents(eqx.Module):
-    """Where a start ended, or each of many, and how many evaluations of the objective it took."""
+    """End of one descent, or of each of many, and the evaluations of the objective it took."""
 
     points: Float[Array, "*start variable"]
     values: Float[Array, "*start"]
@@ -100,7 +100,7 @@ class Search(Module):
 
     - `evaluations`: number of evaluations of the objective, with or without its gradient: all
       samples, each descent up to its own end and those of the improvement.
-    - `failed`: how many samples and descents met an objective that is not finite.
+    - `failed`: number of samples and descents that met an objective that is not finite.
     """
 
     found: tuple[Found, ...]

@@ -9,7 +9,7 @@ with the slope s, the curvature c and that increase Δ.
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -31,7 +31,7 @@ _ONE_PERCENT = 0.01
 class FreeValue:
     """A free number of a design, in the package's unit.
 
-    - `shots`: that it belongs to, from 1; none for the width, which all share.
+    - `shots`: shots with this number, from 1; none for the width, which all share.
     - `tolerance`: the change that makes the objective worse by 1 %; None where none does.
     """
 
@@ -39,10 +39,10 @@ class FreeValue:
     shots: tuple[int, ...]
     value: float
     tolerance: float | None
+    unit: str = field(init=False)
 
-    @property
-    def unit(self) -> str:
-        return QUANTITIES[self.variable].unit
+    def __post_init__(self):
+        object.__setattr__(self, "unit", QUANTITIES[self.variable].unit)
 
     def __str__(self) -> str:
         """Value and tolerance as reported: "20.18 (±0.35)"."""

@@ -25,7 +25,7 @@ QUANTITIES = quantities(Design)  # what may be free
 
 @dataclass(frozen=True)
 class ReportedNumber:
-    """Format in which a number of a shot is reported, in the unit of its field; light in nm.
+    """Format in which a number of a shot is reported, in the unit of its attribute; light in nm.
 
     - `name`: in tables and on axes.
     """
@@ -76,7 +76,7 @@ class Variable:
 
     - `name`: name of one of the numbers of `Design`; `DesignSpace` refuses any other.
     - `lower`, `upper`: its bounds, in the design's units.
-    - `captures`: which captures share it; for the width, which all share, nothing.
+    - `captures`: numbers of the captures that share it; none for the width, which all share.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Limits:
     - `mask_pixel`: pixel of the display or printer, mm: the zones at the mask's edge keep a period
       of two of them, β·width ≤ π/mask_pixel.
     - `thickness`: the longest distance of mask and sensor, mm.
-    - `captures`: how many at most.
+    - `captures`: largest number of captures.
     - `exposure`: exposure of all captures together, shares: what the free ones leave is divided
       among the others as their own shares are.
     """
@@ -176,7 +176,7 @@ class DesignSpace(eqx.Module):
         return self.lower + point * (self.highest(width) - self.lower)
 
     def point(self, design: Design) -> Float[Array, " variable"]:
-        """Where a design lies in the unit cube, or outside of it; ½ where there is no room.
+        """Place of a design in the unit cube, or outside of it; ½ along an axis without extent.
 
         Of a number that captures share, the first one's counts.
         """

@@ -17,7 +17,7 @@ from thincam_jax.design.search import on_cube
 
 
 class Descent(Module):
-    """Where a stochastic descent ended.
+    """End of a stochastic descent.
 
     - `design`, `values`, `point`: design at the mean of the second half of the steps, its free
       numbers, and that point of the cube.

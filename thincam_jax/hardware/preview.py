@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from thincam_jax._core.controls import Control, turned
+from thincam_jax._core.controls import Control, View, turned
 from thincam_jax._core.files import write_whole
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
 from thincam_jax.hardware.acquisition.rig import Rig
@@ -60,28 +60,6 @@ class FrameNumbers:
             float(np.mean((around - 4 * inner) ** 2)) / level,
             counts / counts.max(),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class FrameView:
-    """A frame as a page shows it; see `Message`."""
-
-    pictures: dict[str, bytes]
-    values: dict[str, float]
-    lines: tuple[str, ...]
-    histogram: np.ndarray
-
-    def message(self) -> tuple[str, list[bytes]]:
-        header = {
-            "names": [*self.pictures],
-            "transfer": [round(float(n), 4) for n in self.histogram],
-            "step": 1 / _BINS,
-            "zero": None,
-            "cut_off": 0,
-            "lines": self.lines,
-            "values": self.values,
-        }
-        return json.dumps(header), [*self.pictures.values()]
 
 
 class Preview:
@@ -147,14 +125,14 @@ class Preview:
         if self.values.get("position") != before:
             self._position = self.values["position"]
 
-    def view(self, *, rest: bool = False) -> FrameView:
+    def view(self, *, rest: bool = False) -> View:
         """The next frame; `rest` keeps it in the folder."""
         try:
             frame = self._frame()
         except HardwareError as error:
             with suppress(HardwareError):
                 self.taker.recover(error)
-            return FrameView({}, dict(self.values), (str(error),), np.zeros(0))
+            return View(dict(self.values), {}, 1 / _BINS, np.zeros(0), lines=(str(error),))
         numbers = FrameNumbers.of(frame)
         now = time.monotonic()
         rate = 1 / max(now - self._seen, 1e-6)
@@ -172,7 +150,8 @@ class Preview:
         if self.image is not None and self._pattern == 0:
             image = np.clip(self.image(frame.pixels.astype(np.float32)), 0, 1)
             pictures["image"] = jpeg_bytes(np.round(255 * image).astype(np.uint8))
-        return FrameView(pictures, dict(self.values), tuple(lines), numbers.histogram)
+        histogram = 1 / _BINS, numbers.histogram
+        return View(dict(self.values), pictures, *histogram, lines=tuple(lines))
 
     def _found(self, frame: Frame, now: float) -> tuple[str, ...]:
         """Findings in a frame, or in one of these settings that is not long ago."""

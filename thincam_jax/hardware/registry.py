@@ -91,7 +91,7 @@ def driver_report() -> list[str]:
 
 @checked
 def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
-    """Open a device; `options` are fields of the driver's `Options`."""
+    """Open a device; `options` are attributes of the driver's `Options`."""
     chosen, given = driver(kind, name), dict(options or {})
     allowed = [field.name for field in fields(chosen.Options)]
     if unknown := set(given) - set(allowed):

@@ -34,7 +34,7 @@ def encode_srgb(light: np.ndarray) -> np.ndarray:
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """An image (y, x, …) as it is to be seen, of the one that is stored with an orientation."""
+    """An image (y, x, …) turned upright from the orientation in which it is stored."""
     if orientation in (5, 6, 7, 8):
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -113,7 +113,7 @@ def png_bytes(pixels: np.ndarray, gamma: float | int | None = None) -> bytes:
     buffer, info = io.BytesIO(), PIL.PngImagePlugin.PngInfo()
     if gamma is not None:
         info.add(b"gAMA", struct.pack(">I", min(max(round(1e5 / gamma), 1), 2**31 - 1)))
-    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info)
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info, compress_level=3)
     return buffer.getvalue()
 
 

@@ -149,12 +149,17 @@ class Spectrum(Module):
         count = wavelengths.size
         self.wavelengths = checks.wavelengths("wavelengths", wavelengths)
         if weights is None:
-            weights = jnp.full(count, 1 / max(count, 1), self.wavelengths.dtype)
+            weights = np.full(count, 1 / max(count, 1), self.wavelengths.dtype)
         self.weights = checks.finite("weights", weights, "parts of one", shape=(count,))
         if count == 0:
             raise ValueError("wavelengths is empty; give at least one wavelength in mm")
         if not checks.is_traced(self.weights) and (np.asarray(self.weights) < 0).any():
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
+
+    @property
+    def colours(self) -> list[tuple[Number, Number]]:
+        """Pairs of wavelength, mm, and weight."""
+        return list(zip(*map(checks.each, (self.wavelengths, self.weights)), strict=True))
 
     def filtered(self, wavelengths: Numbers, transmission: Numbers) -> "Spectrum":
         """This light behind a colour filter, such as one of a sensor's three.

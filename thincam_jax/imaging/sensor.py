@@ -114,13 +114,6 @@ class Sensor(Module):
         return self.exposure is not None or self.electrons is not None
 
 
-def as_sensor(given: Any) -> Sensor:
-    """The check of a field that is a sensor."""
-    if not isinstance(given, Sensor):
-        raise TypeError(f"sensor is a {type(given).__name__}; give a thincam_jax.Sensor")
-    return given
-
-
 class AbstractNoise(Module):
     """Adds the randomness of a read-out to a noise-free image."""
 

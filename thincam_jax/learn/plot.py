@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.learn.refocusing.use import SURE
+from thincam_jax.learn.refocusing.learned import SURE
 from thincam_jax.plot.frame import drawing, grey_levels, white_level
 
 if TYPE_CHECKING:
+    from thincam_jax.learn.refocusing.learned import Reading
     from thincam_jax.learn.refocusing.network import RefocusNetwork
     from thincam_jax.learn.refocusing.scenes import Batch
-    from thincam_jax.learn.refocusing.use import Reading
     from thincam_jax.learn.training import TrainingState
 
 _SMOOTHED = 25  # steps

@@ -2,12 +2,9 @@
 
 import functools
 import math
-import warnings
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,9 +14,8 @@ from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
-from thincam_jax.imaging.sensor import Sensor, as_sensor
-from thincam_jax.lensless.masks.base import AbstractMask, other_models
-from thincam_jax.lensless.method import SAMPLED, AccuracyWarning, Model
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.masks.base import AbstractMask
 
 _positive_or_infinite = functools.partial(checks.positive, unit="mm", allow_infinity=True)
 
@@ -182,51 +178,6 @@ class ChiefRay(eqx.Module):
 
 # Relative L2 error of a zone plate's PSF for a radian of phase left out at the mask's edge.
 ERROR_PER_RADIAN = 0.22
-_LARGEST_ERROR = 0.05
-
-
-def require_off_axis(mask: AbstractMask, path: LightPath, model: Model) -> None:
-    """ValueError for a model on the axis only; AccuracyWarning where the ray is too steep for it.
-
-    Known numbers only: of traced ones, the model alone is looked at.
-    """
-    if (path.at is None and path.place is None) or model in (*SAMPLED, "geometric"):
-        return
-    if path.at is None and model in ("separable", "radial"):  # the waves of the axis, moved
-        return
-    if model != "separable":
-        raise ValueError(
-            f"model {model!r} is for points on the axis: leave `at` out, or use "
-            + (other_models(mask) if model != "radial" else "'angular_spectrum'")
-        )
-    if checks.holds_traced(mask, path):
-        return
-    with jax.ensure_compile_time_eval():
-        finest = mask.finest_frequency
-        if finest is None:
-            return
-        ray = path.chief_ray(mask.centre)
-        assert ray is not None
-        cosine, distance = float(ray.cosine), float(path.distance / path.magnification)
-    phase = third_order(float(path.wavelength), distance, float(np.asarray(finest)), cosine)
-    if ERROR_PER_RADIAN * phase > _LARGEST_ERROR:
-        angle = math.degrees(math.acos(cosine))
-        warnings.warn(
-            f"at {angle:.0f}° waves of third order about the ray, which 'separable' leaves out, "
-            f"turn by up to {phase:.2g} rad; 'angular_spectrum' has them",
-            AccuracyWarning,
-            stacklevel=5,
-        )
-
-
-def third_order(wavelength: float, distance: float, frequency: float, cosine: float) -> float:
-    r"""Phase of third order about the chief ray, rad, at a frequency ν of the mask's light.
-
-    :math:`\tfrac{\pi}{\lambda D^2}\,s\,c^2 u^3` with D = d/c at u = λDν/c², where that light
-    meets the plane of incidence: :math:`\pi s \lambda^2 d \nu^3 / c^5`.
-    """
-    sine = math.sqrt(1 - cosine**2)
-    return math.pi * sine * wavelength**2 * distance * frequency**3 / cosine**5
 
 
 def shift_variance(
@@ -250,14 +201,6 @@ def psf_change(wavelength: float, distance: float, frequency: float, cosine: flo
     return 2 * ERROR_PER_RADIAN * math.sin(min(phase, math.pi) / 2)
 
 
-def _mask(given: Any) -> AbstractMask:
-    if not isinstance(given, AbstractMask):
-        raise TypeError(
-            f"mask is a {type(given).__name__}; give a mask, such as a FresnelZoneAperture"
-        )
-    return given
-
-
 class LenslessCamera(Module):
     """A coded mask in the plane z = 0 and a sensor at z = `distance`; objects at z < 0.
 
@@ -279,8 +222,14 @@ class LenslessCamera(Module):
     **See also**: `FresnelZoneAperture`, `Sensor`, `psf`, `capture`, `Mosaic`.
     """
 
-    mask: AbstractMask = eqx.field(converter=_mask)
-    sensor: Sensor = eqx.field(converter=as_sensor)
+    mask: AbstractMask = eqx.field(
+        converter=functools.partial(
+            checks.instance, "mask", AbstractMask, "a mask, such as a FresnelZoneAperture"
+        )
+    )
+    sensor: Sensor = eqx.field(
+        converter=functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
+    )
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     place: Float[Array, "2"] | None = eqx.field(
         default=None, converter=quantity("mm", shape=(2,), optional=True), kw_only=True

@@ -90,7 +90,7 @@ class MosaicPart:
 class Exposure:
     """One exposure, in plain numbers: equal ones are taken once for all methods.
 
-    The fields are those of `Exposures`.
+    The attributes are those of `Exposures`.
     """
 
     beta: Plain

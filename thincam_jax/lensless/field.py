@@ -166,7 +166,7 @@ def field_operator(
     tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
     method = replace(as_method(model, pixel_integration=True), field_tolerance=tolerance)
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
-    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
+    colours = spectrum.colours
     return field_fit(camera, colours, object_distance, field_shape, method)
 
 
@@ -177,7 +177,7 @@ def field_fit(
     field_shape: tuple[int, int],
     method: PsfMethod,
 ) -> LowRankFit:
-    """`field_operator` of (wavelength, weight) pairs, by a method with its `field_tolerance`."""
+    """`field_operator` of (wavelength, weight) pairs; `method` has a `field_tolerance`."""
     assert method.field_tolerance is not None
     tolerance, tangents = method.field_tolerance, tangents_of(camera, field_shape)
     sensor, grid = camera.sensor, kernel_grid(camera.sensor.grid, field_shape)

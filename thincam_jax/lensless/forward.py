@@ -29,13 +29,13 @@ _STEP = 16
 
 
 def expose(
-    camera: LenslessCamera, plane: ImagePlane, spectrum: Spectrum, model: Model | PsfMethod
+    camera: LenslessCamera, plane: ImagePlane, spectrum: Spectrum, method: PsfMethod
 ) -> Float[Array, "*batch y x"]:
     """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
     shape = projected_shape(camera, plane)
-    shape = shape if as_method(model, True).field_tolerance else in_steps(shape)
+    shape = shape if method.field_tolerance else in_steps(shape)
     check_memory(camera.sensor, shape, plane.image.shape[:-2])
-    seen = imaging_operator(camera, spectrum, plane.distance, field_shape=shape, model=model)
+    seen = operator_of(camera, spectrum.colours, plane.distance, shape, method)
     return seen(project(camera, plane, shape))
 
 
@@ -51,12 +51,11 @@ def imaging_operator(
     """The operator from a plane's projection on the sensor's pitch to the noise-free capture.
 
     `light` is a `Spectrum` or one wavelength in mm; the PSF is the weighted sum over it. The other
-    arguments are those of `psf`. With a method's `field_tolerance` it is a `field_operator`.
+    arguments are those of `psf`. With a `field_tolerance` it is a `field_operator`.
     """
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
-    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
     method = as_method(model, pixel_integration)
-    return operator_of(camera, colours, object_distance, field_shape, method)
+    return operator_of(camera, spectrum.colours, object_distance, field_shape, method)
 
 
 def operator_of(

@@ -12,6 +12,7 @@ import numpy as np
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, AccuracyWarning, Precision, precision_of
+from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -19,8 +20,9 @@ from thincam_jax.lensless.masks.base import (
     term_count,
     zone_orders,
 )
+from thincam_jax.lensless.masks.openings import RadialMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.lensless.masks.pinhole import RadialMask
+from thincam_jax.lensless.propagation.skew import focuses_on_a_line
 
 Model = Literal[
     "geometric",
@@ -44,6 +46,8 @@ CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMP
 PIXEL_NODES = 24
 # Points a pixel for its average then: 1 to 4 % off where a pixel holds some ten fringes.
 LATTICE_POINTS = 21
+# Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
+_IN_CELL, _UNKNOWN_CELL = 16, 7
 _LATTICE = (
     "pixel averages of a mask of {} are taken at "
     f"{LATTICE_POINTS} points a pixel, 1 to 4 % off where cells are fine; "
@@ -52,7 +56,7 @@ _LATTICE = (
 
 
 def parts_of(mask: AbstractMask) -> str:
-    """Number of those whose fields an exact model adds up, in words."""
+    """Number of terms, rings or samples whose waves a model adds up, in words."""
     if isinstance(mask, AbstractFactoredMask):
         return f"{term_count(mask).terms} terms"
     return f"{mask.rings.size} rings" if isinstance(mask, RadialMask) else "samples"
@@ -70,7 +74,7 @@ def models_of(mask: AbstractMask) -> tuple[Model, ...]:
 
 @dataclass(frozen=True)
 class PsfMethod:
-    """Method for computing a PSF: a model with its settings, in place of the model's name.
+    """A model of the PSF with its settings, in place of the model's name.
 
     - `model`: "geometric", "paraxial", "closed_form", "separable", "radial", "angular_spectrum" or
       "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`. "separable",
@@ -145,7 +149,7 @@ class PsfMethod:
 
 
 def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMethod:
-    """The method of that name, or itself, averaged over pixels unless either says no."""
+    """A model's settings, given or by its name; averaged over pixels unless either says no."""
     method = model if isinstance(model, PsfMethod) else PsfMethod(model)
     return method if pixel_integration else replace(method, pixel_integration=False)
 
@@ -153,7 +157,7 @@ def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMe
 def psf_method(
     mask: AbstractMask, grid: Grid, model: Model | PsfMethod, pixel_integration: bool = True
 ) -> PsfMethod:
-    """The method with the defaults for a mask and grid in place of None."""
+    """The settings with the defaults for a mask and grid in place of None."""
     method = as_method(model, pixel_integration)
     precision = method.precision or precision_of(grid.pitch)
     method = replace(method, precision=precision, field_tolerance=None)
@@ -172,6 +176,31 @@ def psf_method(
         oversampling=method.oversampling or max(least, _samples_of_cells(mask, grid)),
         mask_shape=method.mask_shape or _mask_plane(mask, grid),
     )
+
+
+def sampled_off_axis(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> PsfMethod:
+    """The settings given, or those of samples where "separable" has no closed form.
+
+    Rings have none off the axis; cells off both axes, whose integrals do not separate; and zones
+    that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
+    edge's wave, leave about 1 %.
+    """
+    if method.model != "separable" or path.at is None:
+        return method
+    cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
+    beyond = path.skew and (cells or focuses_on_a_line(mask, path))
+    if not (beyond or mask.exact_model == "radial"):
+        return method
+    samples = _UNKNOWN_CELL
+    if not checks.holds_traced(mask, grid, replace(path, at=None)):
+        with jax.ensure_compile_time_eval():  # they are known under jit, too
+            zone = math.sqrt(path.wavelength * path.distance / path.magnification)
+            finest = mask.finest_frequency
+            cell = zone if finest is None else 0.5 / float(finest)
+            samples = odd_from(_IN_CELL * float(grid.pitch) / math.sqrt(cell * zone))
+    return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)
 
 
 def require_odd(oversampling: int) -> None:

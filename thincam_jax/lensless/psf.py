@@ -5,6 +5,7 @@ import math
 import operator
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,7 +27,8 @@ from thincam_jax._core.precision import (
     squared_modulus,
     turn_phasor,
 )
-from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner
+from thincam_jax._core.progress import watched
+from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
 from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, as_method
@@ -43,6 +45,9 @@ from thincam_jax.lensless.propagation.separable import (
 )
 from thincam_jax.lensless.propagation.skew import skew_image
 from thincam_jax.lensless.resolve import resolve
+
+# Samples along an axis of the programs of closed forms, and of each more.
+_FEW, _STEP = 256, 1024
 
 
 @checked
@@ -109,24 +114,7 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
-    grid, wide = camera.sensor.grid, _in_steps(camera, path, method)
-    if wide is grid:
-        return _computed(_psf, camera, path, method)
-    h = _computed(_psf, camera.on_grid(wide), path, method)
-    return cut(h, middle_corner(grid.shape, wide.shape), grid.shape)
-
-
-def _in_steps(camera: LenslessCamera, path: LightPath, method: PsfMethod) -> Grid:
-    """More samples of a closed form, up to a step, within which sizes share a program.
-
-    It takes a second to compile, and hundredths to run.
-    """
-    grid = camera.sensor.grid
-    closed = method.model == "separable" and not path.skew and has_few_terms(camera.mask)
-    if not closed or checks.holds_traced(camera.mask, grid, path):
-        return grid
-    rows, columns = (n + (-n - n % 2) % 2 ** max(1, n.bit_length() - 2) for n in grid.shape)
-    return grid.with_shape((rows, columns))
+    return _computed(_psf, camera, path, method)
 
 
 def spectral_psf(
@@ -240,9 +228,15 @@ def _contrast(h: Float[Array, "y x"], grid: Grid, rho: Float[Array, " n"]) -> Fl
 
 
 def _irradiance(
-    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+    mask: AbstractMask | SeparableSum, grid: Grid, path: Any, method: Any
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
-    """The PSF in the form in which the model has it: terms where there are terms, else an image."""
+    """The PSF in the form in which the model has it: terms where there are terms, else an image.
+
+    In place of a mask, its terms on the grid and beyond it.
+    """
+    if isinstance(mask, SeparableSum):
+        rows, columns = grid.shape
+        return SeparableSum(mask.rows[:, :rows], mask.columns[:, :columns], grid)
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
         nodes = method.nodes if method.pixel_integration else None
@@ -282,7 +276,7 @@ def closed_terms(
 
 
 @jax.jit(static_argnames="method")
-def _psf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
+def _psf(mask, grid: Grid, path, method):
     h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         h = h.sample(grid, pixel_integration=method.pixel_integration)
@@ -290,7 +284,7 @@ def _psf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
 
 
 @jax.jit(static_argnames="method")
-def _otf(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod):
+def _otf(mask, grid: Grid, path, method):
     h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         return h.transform(grid)
@@ -311,11 +305,26 @@ def _computed(
     """`function` of what `resolve` gives, in the camera's precision."""
     if path.at is None and path.place is not None and as_method(model).model in SAMPLED:
         path = replace(path, at=jnp.zeros_like(path.place))  # these follow the ray
-    *numbers, method = resolve(camera, path, model, pixel_integration)
-    with allow(method.float_type, *numbers):
-        result = function(*numbers, method)
+    mask, grid, path, method = resolve(camera, path, model, pixel_integration)
     own = precision_of(camera.sensor.pitch)
+    with allow(method.precision or own, mask, grid, path), watched("computing the PSF"):
+        result = function(*_with_terms(mask, grid, path, method))
     return result if method.precision == own else cast(result, own)
+
+
+def _with_terms(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod) -> Any:
+    """Known numbers with the terms of a closed form in place of the mask, as `_irradiance` takes.
+
+    All grids of up to as many samples share their program, which takes a second to compile.
+    """
+    closed = method.model == "separable" and not path.skew and has_few_terms(mask)
+    if not closed or checks.holds_traced(mask, grid, path):
+        return mask, grid, path, method
+    most = max(grid.shape)
+    count = _FEW if most <= _FEW else _STEP * math.ceil(most / _STEP)
+    rows, columns = (np.arange(count) - (n - 1) / 2 for n in grid.shape)
+    places = SparseGrid(rows, columns, grid.pitch)
+    return closed_terms(mask, places, path, method), grid, None, None
 
 
 def _unfocused(mask: AbstractMask, path: LightPath) -> AbstractMask:

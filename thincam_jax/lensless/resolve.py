@@ -18,15 +18,16 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import allow, cast, itemsize_of, precision_of
-from thincam_jax.lensless.camera import LenslessCamera, LightPath, require_off_axis
+from thincam_jax.lensless.camera import ERROR_PER_RADIAN, LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
     has_few_terms,
+    other_models,
     term_count,
 )
+from thincam_jax.lensless.masks.openings import RadialMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     SAMPLED,
@@ -36,11 +37,11 @@ from thincam_jax.lensless.method import (
     as_method,
     odd_from,
     psf_method,
+    sampled_off_axis,
 )
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 from thincam_jax.lensless.propagation.radial import profile_length, profile_samples
 from thincam_jax.lensless.propagation.separable import pixel_nodes
-from thincam_jax.lensless.propagation.skew import focuses_on_a_line
 
 
 class SamplingWarning(UserWarning):
@@ -137,6 +138,54 @@ def require_phase_sampling(
         f"{fault}: give oversampling = {enough} or more, or a mask of coarser cells or gentler "
         "slopes"
     )
+
+
+# Error of waves of third order, relative, that is warned of.
+_MOST_LEFT_OUT = 0.05
+
+
+def require_off_axis(mask: AbstractMask, path: LightPath, model: Model) -> None:
+    """ValueError for a model on the axis only; AccuracyWarning where the ray is too steep for it.
+
+    Known numbers only: of traced ones, the model alone is looked at.
+    """
+    if (path.at is None and path.place is None) or model in (*SAMPLED, "geometric"):
+        return
+    if path.at is None and model in ("separable", "radial"):  # the waves of the axis, moved
+        return
+    if model != "separable":
+        raise ValueError(
+            f"model {model!r} is for points on the axis: leave `at` out, or use "
+            + (other_models(mask) if model != "radial" else "'angular_spectrum'")
+        )
+    if checks.holds_traced(mask, path):
+        return
+    with jax.ensure_compile_time_eval():
+        finest = mask.finest_frequency
+        if finest is None:
+            return
+        ray = path.chief_ray(mask.centre)
+        assert ray is not None
+        cosine, distance = float(ray.cosine), float(path.distance / path.magnification)
+    phase = third_order(float(path.wavelength), distance, float(np.asarray(finest)), cosine)
+    if ERROR_PER_RADIAN * phase > _MOST_LEFT_OUT:
+        angle = math.degrees(math.acos(cosine))
+        warnings.warn(
+            f"at {angle:.0f}° waves of third order about the ray, which 'separable' leaves out, "
+            f"turn by up to {phase:.2g} rad; 'angular_spectrum' has them",
+            AccuracyWarning,
+            stacklevel=5,
+        )
+
+
+def third_order(wavelength: float, distance: float, frequency: float, cosine: float) -> float:
+    r"""Phase of third order about the chief ray, rad, at a frequency ν of the mask's light.
+
+    :math:`\tfrac{\pi}{\lambda D^2}\,s\,c^2 u^3` with D = d/c at u = λDν/c², where that light
+    meets the plane of incidence: :math:`\pi s \lambda^2 d \nu^3 / c^5`.
+    """
+    sine = math.sqrt(1 - cosine**2)
+    return math.pi * sine * wavelength**2 * distance * frequency**3 / cosine**5
 
 
 def samples_needed(mask: AbstractMask, grid: Grid, path: LightPath, model: Model) -> int:
@@ -323,8 +372,6 @@ def convolution_cost(
 AVERAGES = 1 / 4
 # Operations of samples chosen by default, some ten seconds, that are warned of.
 _SLOW = 1e10
-# Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
-_IN_CELL, _UNKNOWN_CELL = 16, 7
 
 
 def resolve(
@@ -333,7 +380,7 @@ def resolve(
     model: Model | PsfMethod,
     pixel_integration: bool = True,
 ) -> tuple[AbstractMask, Grid, LightPath, PsfMethod]:
-    """Mask, samples and path in the method's precision, and the method with all defaults chosen.
+    """Mask, samples and path in the chosen precision, and the model with all settings chosen.
 
     Nothing is examined after it: a model takes these as they are.
 
@@ -375,28 +422,3 @@ def resolve(
             stacklevel=5,
         )
     return mask, grid, path, method
-
-
-def sampled_off_axis(
-    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
-) -> PsfMethod:
-    """The method; in place of "separable" samples where a mask of edges has no closed form.
-
-    That is of rings off the axis, of cells off both axes, whose integrals have no product, and of
-    zones that focus on a line there. Samples of √(cz)/16, c a cell and z = √(λd/M) the zone of an
-    edge's wave, leave about 1 %.
-    """
-    if method.model != "separable" or path.at is None:
-        return method
-    cells = isinstance(mask, AbstractFactoredMask) and not term_count(mask).chirped
-    beyond = path.skew and (cells or focuses_on_a_line(mask, path))
-    if not (beyond or mask.exact_model == "radial"):
-        return method
-    samples = _UNKNOWN_CELL
-    if not checks.holds_traced(mask, grid, replace(path, at=None)):
-        with jax.ensure_compile_time_eval():  # they are known under jit, too
-            zone = math.sqrt(path.wavelength * path.distance / path.magnification)
-            finest = mask.finest_frequency
-            cell = zone if finest is None else 0.5 / float(finest)
-            samples = odd_from(_IN_CELL * float(grid.pitch) / math.sqrt(cell * zone))
-    return replace(method, model="angular_spectrum", nodes=None, oversampling=samples)

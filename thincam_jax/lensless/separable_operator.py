@@ -101,7 +101,7 @@ def _factors(camera, scene: Scene, grid: Grid, method: PsfMethod):
     """Σ_f Y_f X_f = h, the weighted sum over the light."""
     (plane,), light = scene.planes, scene.spectrum
     rows, columns = [], []
-    for wavelength, weight in zip(light.wavelengths, light.weights, strict=True):
+    for wavelength, weight in light.colours:
         path = camera.path(wavelength, plane.distance)
         if method.pixel_integration:
             nodes = pixel_nodes(camera.mask, grid, path, method.float_type)

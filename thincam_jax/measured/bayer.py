@@ -57,7 +57,7 @@ def demosaic(
 def demosaiced(
     values: np.ndarray, pattern: Pattern, method: Demosaicing, known: np.ndarray | None, power: int
 ) -> np.ndarray:
-    """`demosaic`, or with a power of 2 of the weights the variance of what it makes of noise."""
+    """`demosaic`, or with a power of 2 of the weights the variance of its noise."""
     sites, channels = colour_sites(values.shape, pattern), []
     for colour in "RGB":
         used = sites[colour] if known is None else sites[colour] & known

@@ -1,7 +1,7 @@
 """Arrays in files of other programs: NPZ, MATLAB, HDF5, FITS and PGM; packed raw frames.
 
-A file of several arrays is given as FILE:KEY. No more is unpacked than the array that is asked for,
-whose size is checked before.
+A file of several arrays is given as FILE:KEY. No more is unpacked than that array, whose size
+is checked before.
 """
 
 import contextlib

@@ -8,14 +8,14 @@ of these names, such as `thincam_jax.waveguide.plot`; results draw their main fi
 """
 
 from thincam_jax._core.names import modules_of
-from thincam_jax.plot.cameras import front as front
-from thincam_jax.plot.cameras import history as history
-from thincam_jax.plot.cameras import landscape as landscape
 from thincam_jax.plot.cameras import mask as mask
 from thincam_jax.plot.cameras import otf as otf
 from thincam_jax.plot.cameras import psf as psf
-from thincam_jax.plot.cameras import sensitivity as sensitivity
 from thincam_jax.plot.images import capture as capture
 from thincam_jax.plot.images import compare as compare
+from thincam_jax.plot.objectives import front as front
+from thincam_jax.plot.objectives import history as history
+from thincam_jax.plot.objectives import landscape as landscape
+from thincam_jax.plot.objectives import sensitivity as sensitivity
 
 __getattr__ = modules_of(__name__)

@@ -11,8 +11,8 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.design.training_search import TrainingError
-from thincam_jax.plot.cameras import draw_landscape
 from thincam_jax.plot.frame import drawing, line_style
+from thincam_jax.plot.objectives import draw_landscape
 
 if TYPE_CHECKING:
     from thincam_jax.design.design import Shot

@@ -2,10 +2,9 @@
 
 import dataclasses
 import functools
-import json
 import math
 import operator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -16,7 +15,7 @@ import numpy as np
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
-from thincam_jax._core.controls import Control, turned
+from thincam_jax._core.controls import Control, View, turned
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import Quantity
 from thincam_jax.imaging.encoding import jpeg_bytes, png_bytes
@@ -49,40 +48,6 @@ _SNR_DB = 30.0
 _MOST_PIXELS = 2048  # of a sensor's side
 _ANGLE = Control("angle", "angle off the axis", "°", -30.0, 30.0, 0.0, math.pi / 180)
 _TOLERANCE = Control("tolerance", "tolerance", "%", 0.1, 20.0, 1.0, 1e-2)
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """Picture of a setting.
-
-    - `pictures`: files of "psf", and at rest of "capture" and "image": JPEG, at rest PNG.
-    - `step`: cycles/mm from one entry of `transfer`, |H| along u at v = 0 over its value at low
-      frequencies, to the next; without zero frequency, which is the background's.
-    - `cut_off`: cycles/mm, where it ends. `zero`: at rest, the first that a zone aperture's fringe
-      scanning cannot carry; None where there is none.
-    - `values`: values of the controls. `lines`: sentences about the setting, at rest.
-    """
-
-    values: dict[str, float]
-    pictures: dict[str, bytes]
-    step: float
-    transfer: np.ndarray
-    cut_off: float
-    zero: float | None = None
-    lines: tuple[str, ...] = ()
-
-    def message(self) -> tuple[str, list[bytes]]:
-        """A header as JSON, and the pictures in the order of its `names`."""
-        header = {
-            "names": [*self.pictures],
-            "step": self.step,
-            "transfer": [round(float(value), 4) for value in self.transfer],
-            "zero": self.zero,
-            "cut_off": self.cut_off,
-            "lines": self.lines,
-            "values": self.values,
-        }
-        return json.dumps(header), [*self.pictures.values()]
 
 
 @checked

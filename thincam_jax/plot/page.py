@@ -55,7 +55,7 @@ _HEADERS = [
 
 
 def page_of(shown: Controlled, title: str, host: str, token: str) -> "Starlette":
-    """The page and its two other addresses; whatever else is asked for does not exist.
+    """The page and its two other addresses; no other one exists.
 
     A request has the host's name and, from a page, its origin, or it is another page's that the
     user's browser was led to: 403. So it is without the token.

@@ -74,7 +74,8 @@ def _draw_lines(
     ax.set(xlabel=_label(path), ylabel="mean PSNR of all targets (dB)")
     if not alone:
         ax.set_title("mean over the other axes; bars: their range", fontsize=9, loc="left")
-    _name_ticks(ax.xaxis, values, place)
+    if any(isinstance(value, str) for value in values):
+        ax.set_xticks(place, [_short(value) for value in values])
     ax.grid(alpha=0.3)
 
 
@@ -96,11 +97,6 @@ def _values(rows: list[dict], path: str) -> tuple[list[Any], np.ndarray]:
     values = list(dict.fromkeys(row[path] for row in rows))
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     return values, np.asarray(values if numbers else range(len(values)), float)
-
-
-def _name_ticks(axis: Any, values: list[Any], place: np.ndarray) -> None:
-    if any(isinstance(value, str) for value in values):
-        axis.set_ticks(place, [_short(value) for value in values])
 
 
 def _short(value: Any) -> str:

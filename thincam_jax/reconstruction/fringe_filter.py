@@ -20,7 +20,7 @@ from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
-from thincam_jax.reconstruction.wiener import require_cameras, require_captures
+from thincam_jax.reconstruction.wiener import each_image, require_cameras, require_captures
 
 
 class FringeFilter(eqx.Module):
@@ -63,13 +63,12 @@ class FringeFilter(eqx.Module):
         rows, columns = (s + max(s, f) for s, f in sizes)
         padded = fast_shape((rows, columns))
         object_distance = checks.positive("object_distance", cameras.object_distance, "mm")
-        magnification = 1 + camera.distance / object_distance
-        grid = Grid(padded, sensor.pitch)
+        grid, ratio = Grid(padded, sensor.pitch), (camera.distance, object_distance)
         shadows = jnp.stack([_shadow(c, object_distance) for c in found])
         if bool(jnp.all(shadows == shadows[0])):
             shadows = shadows[:1]  # one filter for all
-        self.inverse = _inverse_filter(grid, beta, magnification, shadows)
-        self.weights = jnp.asarray(weights, self.inverse.dtype)
+        self.inverse = _inverse_filter(grid, beta, ratio, shadows)
+        self.weights = checks.as_array(weights.astype(self.inverse.dtype))
         self.light = cameras.light(self.field_shape).astype(sensor.pitch.dtype)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
 
@@ -78,9 +77,8 @@ class FringeFilter(eqx.Module):
         captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
         require_captures(captures, (len(self.weights), *self.sensor_shape))
         count, *batch, rows, columns = captures.shape
-        flat = captures.reshape(count, -1, rows, columns)
-        images = [self._image(flat[:, i]) for i in range(flat.shape[1])]
-        image = jnp.stack(images).reshape(*batch, *self.field_shape)
+        image = each_image(self._image, captures.reshape(count, -1, rows, columns))
+        image = image.reshape(*batch, *self.field_shape)
         return Reconstruction(image, self.object_pitch, "fringe_scanning")
 
     @eqx.filter_jit
@@ -139,8 +137,10 @@ def _shadow(camera: LenslessCamera, object_distance: Number) -> Float[Array, "2"
 
 
 @jax.jit
-def _inverse_filter(grid: Grid, beta, magnification, shadows) -> Complex[Array, "n v u"]:
+def _inverse_filter(grid: Grid, beta, distances, shadows) -> Complex[Array, "n v u"]:
     """(β'/π)·exp(−jπ²ρ²/β') where the window samples it, else zero; for each shadow's middle."""
+    distance, object_distance = distances
+    magnification = 1 + distance / object_distance
     beta = beta / magnification**2
     v, u = jnp.fft.ifftshift(grid.v)[:, None], jnp.fft.ifftshift(grid.u)
     sampled = (jnp.abs(v) < beta * grid.shape[0] * grid.pitch / (2 * jnp.pi)) & (

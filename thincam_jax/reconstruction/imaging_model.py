@@ -178,9 +178,8 @@ class Cameras(Module):
     def colours(self) -> list[list[tuple[Any, Any]]]:
         """Wavelengths of each camera's light, mm, with their weights."""
         if isinstance(self.wavelength, Spectrum):
-            light = self.wavelength
-            return [list(zip(light.wavelengths, light.weights, strict=True))] * self.count
-        return [[(wavelength, 1.0)] for wavelength in self.wavelengths]
+            return [self.wavelength.colours] * self.count
+        return [[(wavelength, 1.0)] for wavelength in checks.each(self.wavelengths)]
 
     @property
     def wavelengths(self) -> Float[Array, " camera"]:
@@ -210,7 +209,7 @@ class Cameras(Module):
     def light(self, field: tuple[int, int]) -> Float[Array, "m n"]:
         """Light of a field's points, 1 on the axis; one 1 for all without a `field_tolerance`."""
         if not self.over_field:
-            return jnp.ones((1, 1))
+            return checks.as_array(np.ones((1, 1)))
         sensor, tangents = self._furthest.sensor, tangents_of(self._furthest, field)
         return jnp.asarray(light_over_field(sensor, *tangents))
 
@@ -247,7 +246,7 @@ class Cameras(Module):
             own = own_field(field, ratio)
             planes = [self.own_psf(number, own, distance) for distance in distances]
             own_scale = [k if ratio == 1 else register(k, ratio) / ratio**2 for k in planes]
-            kernels.append(jnp.stack(own_scale)[None])
+            kernels.append(checks.stacked([checks.stacked(own_scale)]))
         return kernels
 
     def own_psf(self, number: int, field: tuple[int, int], distance: Number) -> Float[Array, "k l"]:

@@ -28,7 +28,7 @@ from thincam_jax.reconstruction.other_psf import better_psf
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.problem import InverseProblem, compiled_objective
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
@@ -60,6 +60,8 @@ _BALANCED = 30
 # How often pixels are made twice as large, and the tolerance there: the image is only a start.
 # From it an image ends that changes by less than this times the tolerance in ten iterations.
 _COARSER, _ROUGH, _STILL = 2, 3e-3, 100.0
+# Iterations after which penalties that suit an image have lowered the objective, or are balanced.
+_TRIED = 20
 # Variation of an image whose smooth light counts less, in parts of the first one's, below which it
 # is taken: 0.35 to 0.85 where shading had spoilt detail. That of a real hand is 1.0, with haze.
 _CALMER = 0.92
@@ -359,10 +361,20 @@ class AdmmTV(AbstractRegularised):
         image = finer(first.image, problem.field_shape)
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)
-        # Penalties are those of the image, and stay.
+        # Penalties are those of the image, and stay: unless they lead away, as from smooth misfit.
+        begin, rose = float(np.sum(np.asarray(compiled_objective(problem, image)))), []
+
+        def watch(progress):
+            if progress.iteration == _TRIED and progress.objective > begin:
+                rose.append(progress)
+            return (callback is not None and callback(progress)) or rose
+
         schedule = Schedule(self.iterations, self.tolerance, still=_STILL * self.tolerance)
         method = in_parallel(problem, admm_method, image)
-        second = iterate(method, image, schedule, callback=callback)
+        second = iterate(method, image, schedule, callback=watch)
+        if rose and second.status == "stopped" and self.iterations > _TRIED:
+            third = self._by_admm(problem, second.image, callback, _TRIED)
+            second = _joined(second, third)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
 
     def _from_nothing(self, problem, image, callback) -> Outcome:
@@ -380,11 +392,7 @@ class AdmmTV(AbstractRegularised):
             second = self._by_admm(problem, first.image, callback, first.iterations)
         except KeyboardInterrupt:  # before its iterations, which keep their own best image
             return dataclasses.replace(first, status="interrupted")
-        return dataclasses.replace(
-            second,
-            history=first.history + second.history[1:],
-            seconds=first.seconds + second.seconds,
-        )
+        return _joined(first, second)
 
     def _by_admm(self, problem, image, callback, done: int = 0) -> Outcome:
         """Outcome from any image."""
@@ -396,6 +404,12 @@ class AdmmTV(AbstractRegularised):
         schedule = Schedule(*limits, adapt_until=until, done=done, settled=settled)
         method = in_parallel(problem, admm_method)
         return iterate(method, image, schedule, callback=callback)
+
+
+def _joined(first: Outcome, second: Outcome) -> Outcome:
+    """The second run, which went on with the first one's image."""
+    history, seconds = first.history + second.history[1:], first.seconds + second.seconds
+    return dataclasses.replace(second, history=history, seconds=seconds)
 
 
 class Fista(AbstractRegularised):

@@ -14,10 +14,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from thincam_jax._core import checks
 from thincam_jax._core.environment import usable_cores
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.reconstruction.iterate import AbstractMethod, Residuals
@@ -50,13 +50,13 @@ class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
 
     def image(self, state: tuple[Any, ...]):
         images = _in_threads(lambda m, s: np.asarray(m.image(s)), self.methods, state)
-        return jnp.asarray(np.stack(images).reshape(self.shape))
+        return checks.as_array(np.stack(images).reshape(self.shape))
 
     def objective(self, image: Image):
         values = _in_threads(
             lambda m, i: np.asarray(m.objective(i)), self.methods, self._split(image)
         )
-        return jnp.asarray(np.stack(values).reshape(*self.shape[:-4], -1).sum(axis=-1))
+        return checks.as_array(np.stack(values).reshape(*self.shape[:-4], -1).sum(axis=-1))
 
     def residuals(self, state: tuple[Any, ...]):
         each = tuple(m.residuals(s) for m, s in zip(self.methods, state, strict=True))
@@ -153,7 +153,7 @@ def _weights_of_parts(weight, capture, count: int, colours: int):
 
 def _parts(array: Any, shape: tuple[int, ...]) -> list[Array]:
     """An array's parts along the first axis of a shape; on the host, where nothing is compiled."""
-    return [jnp.asarray(part) for part in np.asarray(array).reshape(shape)]
+    return [checks.as_array(part) for part in np.asarray(array).reshape(shape)]
 
 
 def _in_threads(function: Callable, *sequences) -> list:

@@ -68,7 +68,7 @@ def record(
     light = scene.spectrum
     optics = Cameras(
         cameras,
-        wavelength=light if light.wavelengths.size > 1 else light.wavelengths[0],
+        wavelength=light if light.wavelengths.size > 1 else checks.each(light.wavelengths)[0],
         object_distance=distances[0] if len(distances) == 1 else np.unique(distances),
         model=model,
     )
@@ -80,7 +80,7 @@ def record(
     ]
     variances = None
     if isinstance(noise, GaussianNoise) and not checks.holds_traced(frames):
-        variances = [float(np.mean(noise.variance(one))) for one in frames]
+        variances = [float(np.mean(np.asarray(noise.variance(one)))) for one in frames]
     if mosaic is not None:
         frames = mosaic.split(frames[0])
         variances = variances and variances * len(frames)

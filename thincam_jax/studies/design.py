@@ -113,7 +113,7 @@ class DesignStudy:
     - `settings`: length of the search; `grid`: points along each side of the landscape.
     - `seeds`: number of seeds of the noise in the simulation; `best`: how many of the designs found
       it has.
-    - `photographs`: how many further ones the best design is compared on with the one to beat,
+    - `photographs`: number of further ones on which the best design meets the one to beat,
       none of them trained on; 0 for none.
     - `training`, `fronts`: None for none.
     """

@@ -19,7 +19,6 @@ from thincam_jax.studies.design_scores import (
     COSTS,
     Candidate,
     DesignScores,
-    FreeNumber,
     FrontScores,
     FrontsScores,
     ObjectiveScores,
@@ -153,8 +152,7 @@ def _found(objective: AbstractObjective, reference: RankedDesign, one: RankedDes
         predicted_gain=digits(objective.gain(reference.exact, one.exact)),
         training_gain_db=_training_gain(reference, one),
         values=tuple(
-            FreeNumber(v.variable, v.shots, digits(v.value), digits(v.tolerance), v.unit)
-            for v in one.values
+            replace(v, value=digits(v.value), tolerance=digits(v.tolerance)) for v in one.values
         ),
         status=one.status,
         active_limits=one.active,

@@ -108,8 +108,8 @@ class ObjectiveScores:
 class SearchScores:
     """Course of a search.
 
-    - `approximation_off`: how far values as searched are from the exact ones at most, as reported.
-    - `broken_limits`: that the design to beat does not keep, in words.
+    - `approximation_off`: largest difference of searched and exact values, as reported.
+    - `broken_limits`: limits that the design to beat does not keep, in words.
     """
 
     evaluations: int
@@ -133,21 +133,6 @@ class TrainingScores:
 
 
 @dataclass(frozen=True)
-class FreeNumber:
-    """A free number of a design found; see `FreeValue`."""
-
-    variable: str
-    shots: tuple[int, ...]
-    value: float
-    tolerance: float | None
-    unit: str
-
-    def __str__(self) -> str:
-        """The value with its tolerance."""
-        return str(FreeValue(self.variable, (), self.value, self.tolerance))
-
-
-@dataclass(frozen=True)
 class Candidate(WithShots):
     """A design with the values of its objective: as searched, exact, and exact as reported.
 
@@ -164,7 +149,7 @@ class Candidate(WithShots):
     training_error: float | None = None
     predicted_gain: float | None = None
     training_gain_db: float | None = None
-    values: tuple[FreeNumber, ...] = ()
+    values: tuple[FreeValue, ...] = ()
     status: str = ""
     active_limits: tuple[str, ...] = ()
 
@@ -184,7 +169,7 @@ class Validation:
     methods: dict[str, dict[str, Comparison]]
 
     def table(self) -> Table:
-        """PSNR, resolution and what is gained, of each design on each target."""
+        """PSNR, resolution and gain of each design on each target."""
         names = list(next(iter(self.methods.values())))
         headings = ["design"]
         for target in names:
@@ -212,7 +197,7 @@ class PointScores(WithShots):
     - `bayes_error`: error of the best linear reconstruction, as a part of the scene's variance.
     - `dominated`: whether another point dominates it; by the simulated mean, `simulated_dominated`.
       None for the design to beat.
-    - `predicted_psnr_db` and what is simulated: figures of the front of captures.
+    - `predicted_psnr_db` and the simulated figures: of the front of captures only.
     """
 
     cost: float
@@ -232,8 +217,8 @@ class FrontScores:
     """A front: its points in the order of their cost, and the design to beat.
 
     - `label`: label of the cost, with its unit.
-    - `exposure`: how captures share it, in words; `picture_variance`: variance of pictures, for the
-      front of captures.
+    - `exposure`: division among captures, in words; `picture_variance`: variance of pictures, for
+      the front of captures.
     """
 
     label: str
@@ -273,7 +258,7 @@ class FrontScores:
 
 @dataclass(frozen=True)
 class FrontsScores:
-    """The fronts that were asked for; `highest_cycles_per_rad`: that was looked at."""
+    """The fronts requested; `highest_cycles_per_rad`: highest frequency evaluated."""
 
     highest_cycles_per_rad: float
     thickness: FrontScores | None = None
@@ -433,7 +418,7 @@ def _cost(value: float) -> str:
 
 
 def _worth(gain: Spread) -> str:
-    """A gain of PSNR, and what it does to the error: "−1.06 dB (28 % more squared error)"."""
+    """A gain of PSNR, and the change of the error: "−1.06 dB (28 % more squared error)"."""
     change = 100 * (10 ** (-gain.mean / 10) - 1)
     word = "more" if change > 0 else "less"
     return f"{gain.text(2)} dB ({abs(change):.0f} % {word} squared error)"

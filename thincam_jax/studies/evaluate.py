@@ -1,4 +1,4 @@
-"""Captures of a study and their reconstructions: agreement with the scene, and what is resolved."""
+"""Captures of a study and their reconstructions: agreement with the scene, and resolution."""
 
 import functools
 import math
@@ -9,10 +9,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 
+from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.imaging.encoding import as_picture
@@ -20,7 +20,7 @@ from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
-from thincam_jax.imaging.scene import ImagePlane, Scene
+from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import electrons_per_unit, read_out
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless import forward
@@ -46,14 +46,12 @@ class Capture:
     variance: np.ndarray
 
 
-def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
-    """Light on the sensor, (*channel, y, x), without saturation."""
-    scene, pixels = Scene(planes, exposure.wavelength), study.pixel_integration
+def noise_free(study: Study, exposure: Exposure, *planes: ImagePlane) -> Array:
+    """Light of the planes on the sensor, (*channel, y, x), without saturation."""
+    light, pixels = Spectrum(exposure.wavelength), study.pixel_integration
     method = PsfMethod(study.model, None, pixels, field_tolerance=study.field_tolerance)
-    images = (
-        forward.expose(study.camera(exposure), plane, scene.spectrum, method)
-        for plane in scene.planes
-    )
+    camera = study.camera(exposure)
+    images = (forward.expose(camera, plane, light, method) for plane in planes)
     return functools.reduce(operator.add, images)
 
 
@@ -63,15 +61,19 @@ def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: i
     The noise is that of the image; its random key is the same however a study is interrupted, and
     another one for each further trial.
     """
-    seed = jax.random.key((study.seed + trial) % 2**32)
     place = study.exposures.index(exposure)
-    key = jax.random.fold_in(jax.random.fold_in(seed, number), place)
+    key = _noise_key(np.uint32((study.seed + trial) % 2**32), number, place)
     sensor, noise = study.camera(exposure).sensor, study.noise
     if noise is None:
         variance = np.zeros(clean.shape[:-2], clean.dtype)
     else:
         variance = np.asarray(noise.variance(clean, electrons_per_unit(sensor, clean)))
     return Capture(np.asarray(read_out(sensor, clean, noise=noise, key=key)), variance)
+
+
+@jax.jit
+def _noise_key(seed, number, place) -> PRNGKeyArray:
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), number), place)
 
 
 def take(study: Study, exposure: Exposure, target: Target) -> Capture:
@@ -83,7 +85,7 @@ def take(study: Study, exposure: Exposure, target: Target) -> Capture:
 def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
     """Images (capture, *channel, y, x) and variances (capture, *channel)."""
     images, variances = [c.image for c in captures], [c.variance for c in captures]
-    return jnp.asarray(np.stack(images)), jnp.asarray(np.stack(variances))
+    return checks.stacked(images), checks.stacked(variances)
 
 
 # The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
@@ -172,7 +174,7 @@ def check_target(study: Study, target: Target) -> None:
 
     **Errors**: ValueError for a uniform image, or one that covers too few pixels.
     """
-    if target.plane.image.min() == target.plane.image.max():
+    if np.ptp(np.asarray(target.plane.image)) == 0:
         raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
     for method in study.methods:
         shape = field_shape(study, method, target)

@@ -106,7 +106,7 @@ def reconstructed(
 
 
 def finding(methods: Mapping[str, Reconstructed]) -> str:
-    """How near the last method comes, in a sentence."""
+    """Sentence on how well the last method does."""
     name, one = list(methods.items())[-1]
     mean, count = one.scores.mean_psnr_db, len(one.scores.targets)
     near = "exactly" if mean is None else f"at {mean:.1f} dB on average"

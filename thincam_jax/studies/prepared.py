@@ -36,7 +36,7 @@ class PixelNoise:
 
     - `deviation`: standard deviation in the unit of the prepared capture; `counts`: that in counts
       of a raw pixel.
-    - `found`: how it is known, in words.
+    - `found`: origin of the number, in words.
     """
 
     deviation: float
@@ -180,7 +180,7 @@ class PreparedResult:
 
     @property
     def relative_residual(self) -> float:
-        """Norm of what the image leaves unexplained, over that of the capture."""
+        """Norm of the residual over that of the capture."""
         return float(relative_residual(self.problem, self.found.image[:, None]))
 
 

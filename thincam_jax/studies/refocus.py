@@ -94,7 +94,7 @@ class PlacedTarget(Target):
 
 @dataclass(frozen=True)
 class FocusRange:
-    """The distances of a sweep of the focus, and what is called sharp.
+    """The distances of a sweep of the focus, and its measure of sharpness.
 
     - `method`: by name, that the sweep reconstructs with.
     - `nearest`, `farthest`: mm; `count`: number of distances, evenly spaced in 1/t.
@@ -178,7 +178,7 @@ class RefocusStudy:
     def capture(self, exposure: Exposure) -> Capture:
         """One capture of all objects together, (y, x)."""
         planes = [target.plane for target in self.study.targets]
-        return expose(self.study, exposure, noise_free(self.study, exposure, planes), 0)
+        return expose(self.study, exposure, noise_free(self.study, exposure, *planes), 0)
 
     def field_shape(self, method: Method) -> tuple[int, int]:
         """Pixels of a reconstruction: all directions of objects about the axis, and a margin."""
@@ -341,7 +341,7 @@ class RefocusResult:
     images: dict[tuple[str, float], np.ndarray]
 
     def table(self) -> Table:
-        """Where objects were placed, and where they were found."""
+        """Distances at which objects were placed and found."""
         rows = [
             (name, f"{o.distance_mm:g}", o.found_mm, o.error_percent, o.axial_resolution_mm)
             for name, o in self.objects.items()

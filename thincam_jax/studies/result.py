@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ResponseLimits:
-    """Where a response has its first zero crossing (None: it has none) and where it ends."""
+    """Frequencies of a response's first zero crossing, None without one, and of its end."""
 
     first_zero_cycles_per_mm: float | None
     first_zero_object_mm: float | None
@@ -104,9 +104,9 @@ def _profile(study: Study, exposure: Exposure) -> np.ndarray:
     how = {"model": study.model, "pixel_integration": study.pixel_integration}
     # A part of a mosaic, as if it were alone.
     camera = study.camera(exposure).replace(place=None).on_grid(study.sensor.grid)
-    response = otf(camera, **light, **how)
+    response = np.asarray(otf(camera, **light, **how))
     rows, columns = study.sensor.shape
-    return np.asarray(response[rows // 2, columns // 2 :])
+    return response[rows // 2, columns // 2 :]
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class Method:
     - `harmonics`: harmonics of the synthesis of that name.
 
     **Errors**: ValueError for exposures, phases or a solver that do not suit the synthesis, and for
-    one exposure twice; FieldError where one field is to blame.
+    one exposure twice; FieldError where one key is to blame.
     """
 
     name: str

@@ -6,6 +6,7 @@ surface with the top hologram a glass thickness w further, and objects d2 before
 5.5).
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index
-from thincam_jax.imaging.sensor import Sensor, as_sensor
+from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
 
 
@@ -36,31 +37,23 @@ class Rectangle(Module):
         return (abs(points - self.centre) <= self.size / 2).all(axis=-1)
 
 
-def _hologram(given: Any) -> VolumeHologram:
-    if not isinstance(given, VolumeHologram):
-        raise TypeError(f"hologram is {checks.shown(given)}; give a waveguide.VolumeHologram")
-    return given
-
-
 class Screen(Module):
     """A plane-parallel glass plate with the same hologram at the top and at the bottom.
 
     - `hologram`: on the front surface before the camera and on the rear surface before the object.
     - `glass_thickness`: w, mm. `glass_index`: index of the plate.
-    - `top`, `bottom`: where the holograms are, mm from the camera's axis; None: everywhere.
+    - `top`, `bottom`: extents of the holograms, mm from the camera's axis; None: everywhere.
     """
 
-    hologram: VolumeHologram = eqx.field(converter=_hologram)
+    hologram: VolumeHologram = eqx.field(
+        converter=functools.partial(
+            checks.instance, "hologram", VolumeHologram, "a waveguide.VolumeHologram"
+        )
+    )
     glass_thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     glass_index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     top: Rectangle | None = None
     bottom: Rectangle | None = None
-
-
-def _screen(given: Any) -> Screen:
-    if not isinstance(given, Screen):
-        raise TypeError(f"screen is a {type(given).__name__}; give a waveguide.Screen")
-    return given
 
 
 def _tilt(name: str, value: Any) -> Array:
@@ -76,8 +69,12 @@ class SeeThroughCamera(Module):
       It turns about where the camera's axis meets its rear surface; the object's plane stays.
     """
 
-    screen: Screen = eqx.field(converter=_screen)
-    sensor: Sensor = eqx.field(converter=as_sensor)
+    screen: Screen = eqx.field(
+        converter=functools.partial(checks.instance, "screen", Screen, "a waveguide.Screen")
+    )
+    sensor: Sensor = eqx.field(
+        converter=functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
+    )
     focal_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     lens_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     tilt: Float[Array, "2"] = eqx.field(default=None, converter=quantity("rad", check=_tilt))

@@ -187,7 +187,7 @@ def distance_from_ghosts(
       field or is before a dark ground.
     - `nearest`, `farthest`: the range searched, d2 from the plate's front surface, mm. Pixels
       whose first ghost comes from beyond the sensor at `nearest` are not compared.
-    - `orders`: how many ghosts.
+    - `orders`: number of ghosts.
 
     **Errors**: ValueError for a capture of another shape than the sensor, without light or with
     less than 16 rows or columns, for `nearest` that is not below `farthest`, so near that less than

@@ -48,7 +48,7 @@ class ScreenPlan:
 
     Print it for a table. It holds for images like the one that it was made for.
 
-    - `camera`, `plane` (or a tuple of planes): that it was made for.
+    - `camera`, `plane` (or a tuple of planes): subjects of the plan.
     - `tolerance`, `predicted_error`: relative L2 of the noise-free capture.
     - `orders`: ghosts that are modelled, of `all_orders` that can meet the object.
     - `samples`: parts of the band of each pixel and order; None: the Bragg wavelength alone.
@@ -435,7 +435,7 @@ def _cross(camera) -> tuple[float, float]:
 
 
 def _mean_x(rays: _Rays, orders: int):
-    """Where a pixel's light comes from along x, the mean over orders and colours."""
+    """Origin of a pixel's light along x, the mean over orders and colours."""
     weight, x = rays.weight[:orders], rays.points[:orders, ..., 1].mean(axis=-1)
     total = weight.sum(axis=0)
     return (weight * x).sum(axis=0) / np.where(total > 0, total, 1)

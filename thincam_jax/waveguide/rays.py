@@ -73,7 +73,7 @@ def trace(
 
     - `pixels`: (y, x) on the sensor, mm from its middle: (*pixel, 2).
     - `object_distance`: d2, from the plate's front surface, mm; of several planes by `jax.vmap`.
-    - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
+    - `orders`: number of ghosts, i = 0 … orders − 1, of 2i total reflections each.
     - `extent`: limits of the object, (y, x) mm from the camera's axis; None is infinite.
 
     The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg
@@ -163,8 +163,7 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
 
 
 class RayPath(eqx.Module):
-    """Where rays meet the top hologram, (*pixel, 2), the bottom one and the object's plane, (order,
-    *pixel, 2), (y, x) mm."""
+    """Points (y, x), mm, of rays on the holograms and on the object's plane."""
 
     top: Float[Array, "*pixel 2"]
     bottom: Float[Array, "order *pixel 2"]
@@ -187,7 +186,7 @@ def object_points(
 
 
 def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:
-    """Where rays from the lens meet the plate's rear surface, (x, y) on it, mm."""
+    """Points (x, y), mm, at which rays from the lens meet the plate's rear surface."""
     axes = camera.plate_axes
     tangential = product(slope, axes[:2, :2]) + axes[2, :2]
     normal = product(slope, axes[:2, 2]) + axes[2, 2]
@@ -197,7 +196,7 @@ def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Ar
 def straight_on(
     camera: SeeThroughCamera, slope: Float[Array, "*ray 2"], distance: Float[Array, "..."]
 ) -> Float[Array, "*ray 2"]:
-    """Where rays would meet the object without displacement by the plate, (x, y), mm."""
+    """Points (x, y), mm, on the object that rays meet without displacement by the plate."""
     normal, width = camera.plate_axes[:, 2], camera.screen.glass_thickness
     further = width * (normal[:2] + (1 - normal[2]) * slope)
     return (camera.lens_distance + distance) * slope + further
@@ -220,7 +219,7 @@ def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
 
 @checked
 def pixel_centres(camera: SeeThroughCamera) -> Float[Array, "y x 2"]:
-    """Where the sensor's pixels are, (y, x) mm."""
+    """Centres (y, x) of the sensor's pixels, mm."""
     grid = camera.sensor.grid
     return jnp.stack(jnp.meshgrid(grid.y, grid.x, indexing="ij"), axis=-1)
 

@@ -69,7 +69,7 @@ def ghost_images(
     object_distance: Number,
     orders: int = 4,
 ) -> GhostImages:
-    """Where points of an object appear by each order.
+    """Images of an object's points by each order.
 
     **Arguments**
 

@@ -145,7 +145,7 @@ def system_operator(
       and captures (channel, y, x), and the level is that of each channel.
     - `plane`: or a list of planes of as many cells, whose light adds up: a near one hides nothing.
       Images are then (plane, y, x).
-    - `orders`: how many ghosts; those that leave the hologram or miss the object do not count.
+    - `orders`: number of ghosts; those that leave the hologram or miss the object do not count.
     - `samples`: parts of the band of each pixel and order, as `trace_band` divides it; None for
       the Bragg wavelength alone, without the smear of the band.
 

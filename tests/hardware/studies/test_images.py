@@ -52,7 +52,7 @@ def coloured(solver):
     picture = tiny.study().targets[1]
     study = tiny.study(methods=tuple(methods), targets=(picture,), noise=None)
     light = [
-        [np.asarray(noise_free(study, one, [*scene.planes])) for one in method.exposures]
+        [np.asarray(noise_free(study, one, *scene.planes)) for one in method.exposures]
         for method, scene in zip(methods, scenes_of(study), strict=True)
     ]
     clean = mosaic(np.stack(light, 1), "GRBG")

@@ -154,19 +154,18 @@ def _training(config: DesignConfig) -> TrainingPlan | None:
     asked = config.train
     if asked is None:
         return None
+    denoiser = None
+    if asked.reconstruction == "pnp":
+        from thincam_jax.learn import Denoiser  # here: others need not wait for the learned parts
+
+        denoiser = Denoiser()
     return TrainingPlan(
         {name: sample_image(name, linear=True) for name in asked.images},
         TrainingError(asked.reconstruction),
         TrainingSettings(asked.samples, asked.starts, asked.steps, config.search.grid),
         asked.pixels,
-        _denoiser() if asked.reconstruction == "pnp" else None,
+        denoiser,
     )
-
-
-def _denoiser() -> Any:
-    from thincam_jax.learn import Denoiser
-
-    return Denoiser()
 
 
 def _fronts(config: DesignConfig, problem: DesignProblem) -> FrontPlan | None:

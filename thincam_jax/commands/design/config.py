@@ -8,7 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.config_file import slug
+from thincam_jax._core.text import slug
 from thincam_jax.commands.design.config_pareto import LENGTH, ONCE, ParetoConfig, check_pareto
 from thincam_jax.commands.mask import ApertureConfig
 from thincam_jax.commands.schema import LIGHT, Section, form_of, section

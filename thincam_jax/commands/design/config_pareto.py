@@ -83,7 +83,7 @@ class ParetoConfig(section(SearchSettings, only=LENGTH, defaults=_SHORT)):
     @pydantic.model_validator(mode="after")
     def _some(self):
         if self.thickness is None and self.captures is None and self.light is None:
-            raise ValueError("no front is asked for; give thickness, captures or light")
+            raise ValueError("no front is requested; give thickness, captures or light")
         return self
 
     def costs(self, phases: int) -> dict[str, list[float]]:

@@ -6,8 +6,9 @@ from functools import cached_property, partial
 from typing import Any
 
 from thincam_jax._core.table import number
+from thincam_jax._core.text import slug
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.build import as_study_config
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.report import Content, Page, Part, Picture, Sentences, pixels_of

@@ -9,63 +9,83 @@ from typer import Argument, Option
 from thincam_jax.commands.reconstruct import METHODS
 from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, reported, say_result
 
-Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
+Psf = Annotated[Path, Option(help="Image of the measured PSF: TIFF, PNG or NPY.")]
 Background = Annotated[
-    str | None, Option(help="Dark frame, a folder of one each, counts, corner or (default) found.")
+    str | None,
+    Option(
+        help="Black level: a dark frame, a folder of one each, counts, or corner. Default: found."
+    ),
 ]
 PsfBackground = Annotated[
-    str | None, Option(help="That of the PSF, where it was exposed otherwise.")
+    str | None, Option(help="Black level of the PSF, if it was exposed differently.")
 ]
-Bits = Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")]
-PsfBits = Annotated[int | None, Option(help="That of the PSF, where it is another.")]
-Corner = Annotated[str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")]
+Bits = Annotated[int | None, Option(help="Bit depth of the camera, such as 12 in a file of 16.")]
+PsfBits = Annotated[int | None, Option(help="Bit depth of the PSF, if it differs.")]
+Corner = Annotated[
+    str, Option(help="Dark corner of the PSF: its rows and columns, FIRST:AFTER_LAST.")
+]
 PsfScale = Annotated[
     float | None,
-    Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
+    Option(help="Pixel pitch of the PSF over that of the capture; the PSF is enlarged by it."),
 ]
 PsfChannels = Annotated[
-    Literal["each", "mean"], Option(help="each: a PSF for each colour; mean: one for all.")
+    Literal["each", "mean"], Option(help="each: one PSF for each colour; mean: their mean for all.")
 ]
 Crop = Annotated[
     str | None,
-    Option(help="Rows and columns of the captures to use, as 100:740,200:1000. The PSF is whole."),
+    Option(
+        help="Rows and columns of the captures to use, such as 100:740,200:1000; the PSF stays."
+    ),
 ]
 Bayer = Annotated[
     Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
-    Option(help="Colours of the mosaic, from its upper left."),
+    Option(help="Colours of the Bayer mosaic, from its upper left."),
 ]
-Strict = Annotated[bool, Option("--strict", help="Severe findings are errors: exit code 2.")]
-Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")]
+Strict = Annotated[bool, Option("--strict", help="End with exit code 2 at a severe finding.")]
+Dead = Annotated[Path | None, Option(help="Image that marks dead pixels by any value but zero.")]
 
 
 def reconstruct(
-    capture: Annotated[list[Path], Option(help="Capture, or a folder; several: its exposures.")],
-    out: Annotated[
-        Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
+    capture: Annotated[
+        list[Path],
+        Option(
+            help="Capture, or a folder of captures. Repeat it for several exposures of one scene."
+        ),
     ],
-    psf: Annotated[list[Path] | None, Option(help="Measured PSF; several: its exposures.")] = None,
+    out: Annotated[
+        Path,
+        Option(help="Image to write (.png, .npy, .tif), or a folder for a folder of captures."),
+    ],
+    psf: Annotated[
+        list[Path] | None,
+        Option(help="Image of the measured PSF. Repeat it for several exposures."),
+    ] = None,
     exposure: Annotated[
-        list[str] | None, Option(help="As 4ms, of each exposure whose file does not say it.")
+        list[str] | None,
+        Option(help="Exposure time, such as 4ms, for each file that does not hold it."),
     ] = None,
     distances: Annotated[
         str | None,
-        Option(help="60mm,80mm,100mm: refocus; --psf is a folder or TIFF of a PSF for each."),
+        Option(help="Refocus, as 60mm,80mm,100mm; --psf is a folder or TIFF with a PSF for each."),
     ] = None,
     camera: Annotated[
         Path | None,
-        Option(help="In place of --psf, a study (YAML) whose first shot took the capture."),
+        Option(help="Study (YAML) whose first shot describes the camera, in place of --psf."),
     ] = None,
     network: Annotated[
         Path | None,
-        Option(help="Of 'thincam train' for that camera, or 'shipped', in place of a method."),
+        Option(help="Network of 'thincam train' for --camera, or 'shipped', in place of --method."),
     ] = None,
     distance: Annotated[
-        str | None, Option(help="To focus a network on, as 120mm. Default: the study's object.")
+        str | None,
+        Option(
+            help="Distance at which a network focuses, such as 120mm. Default: the study's object."
+        ),
     ] = None,
     set_: Overrides = None,
     background: Background = None,
     psf_background: PsfBackground = None,
-    downsample: Annotated[int, Option(help="Side of the blocks of pixels that are averaged.")] = 1,
+    downsample: Annotated[int, Option(help="Average blocks of so many pixels a side.")] = 1,
     bits: Bits = None,
     psf_bits: PsfBits = None,
     corner: Corner = "5:15",
@@ -74,55 +94,62 @@ def reconstruct(
     bayer: Bayer = None,
     demosaic: Annotated[
         Literal["bilinear", "superpixel"],
-        Option(help="superpixel joins 2×2 pixels: half the size."),
+        Option(help="bilinear: all pixels; superpixel: joins 2×2 pixels to one, at half the size."),
     ] = "bilinear",
     dead: Dead = None,
     saturation: Annotated[
-        float | None, Option(help="Saturated from this part of full scale on.")
+        float | None, Option(help="Pixels from this part of full scale on count as saturated.")
     ] = None,
     noise_threshold: Annotated[
-        float | None, Option(help="Set the PSF to 0 below so many times its noise.")
+        float | None, Option(help="Set the PSF to zero below so many times its noise.")
     ] = None,
     psf_channels: PsfChannels = "each",
     method: Annotated[
-        str, Option(help=f"One of {', '.join(METHODS)}.", autocompletion=lambda: METHODS)
+        str,
+        Option(
+            help=f"Reconstruction method: {', '.join(METHODS)}.", autocompletion=lambda: METHODS
+        ),
     ] = "admm-tv",
     tau: Annotated[
         float | None,
-        Option(help="Weight of total variation relative to noise, about 1 to 3. Default: 2."),
+        Option(help="Weight of total variation relative to the noise, about 1 to 3. Default: 2."),
     ] = None,
     ridge: Annotated[
         float | None,
-        Option(help="Of ridge: noise over image variance, in parts of the expected. Default: 1."),
+        Option(help="Weight of the penalty of ridge, relative to the expected one. Default: 1."),
     ] = None,
     noise: Annotated[
         float | None,
-        Option(help="Of a raw pixel, standard deviation in counts. Default: estimated."),
+        Option(help="Standard deviation of a raw pixel's noise, counts. Default: estimated."),
     ] = None,
     iterations: Annotated[
-        int | None, Option(help="At most. Default: 300; of fista 100, pnp 5, ridge 1000.")
+        int | None, Option(help="Most iterations. Default: 300; fista 100, pnp 5, ridge 1000.")
     ] = None,
     coupling: Annotated[
         Literal["none", "joint", "opponent"] | None,
-        Option(help="Of colours, in total variation. Default: joint."),
+        Option(help="How total variation joins colours. Default: joint."),
     ] = None,
     field: Annotated[
-        Literal["sensor", "full"], Option(help="sensor: what is in front of it; full: all it sees.")
+        Literal["sensor", "full"],
+        Option(
+            help="Field of view. sensor: the scene in front of the sensor; full: all that it sees."
+        ),
     ] = "sensor",
     flip: Annotated[bool, Option("--flip", help="Turn the image by 180°.")] = False,
     linear: Annotated[
-        Literal["npy", "tif", "none"], Option(help="Format of the float image beside a PNG.")
+        Literal["npy", "tif", "none"],
+        Option(help="Format of the linear image that is written beside a PNG."),
     ] = "npy",
-    gamma: Annotated[float, Option(help="Of the PNG.")] = 2.2,
+    gamma: Annotated[float, Option(help="Gamma of the PNG.")] = 2.2,
     white_balance: Annotated[
-        str | None, Option(help="Of the PNG: grey-world, or gains as 1.8,1,1.4.")
+        str | None, Option(help="White balance of the PNG: grey-world, or gains such as 1.8,1,1.4.")
     ] = None,
     strict: Strict = False,
 ) -> None:
-    """Reconstruct captures with a measured PSF, or with that of a camera's numbers.
+    """Reconstruct captures with a known PSF.
 
-    Takes one, or all of a folder. Writes the image, its linear values and a JSON record of all that
-    was done. Ctrl-C keeps the best image so far.
+    The PSF is measured, or computed from a camera's numbers. Takes one capture or a folder. Writes
+    the image, its linear values and a JSON record of each step. Ctrl-C keeps the best image so far.
     """
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
     with reported(lambda: nothing):
@@ -175,12 +202,12 @@ def reconstruct(
 
 def check(
     psf: Psf,
-    capture: Annotated[Path, Option(help="Capture of the same size.")],
+    capture: Annotated[Path, Option(help="Capture of the PSF's size.")],
     background: Background = None,
     psf_background: PsfBackground = None,
     downsample: Annotated[
         int | None,
-        Option(help="Side of the blocks that are averaged. Default: 160 pixels stay, or 320."),
+        Option(help="Average blocks of so many pixels a side. Default: 160 pixels remain, or 320."),
     ] = None,
     bits: Bits = None,
     psf_bits: PsfBits = None,
@@ -190,16 +217,18 @@ def check(
     bayer: Bayer = None,
     dead: Dead = None,
     psf_channels: PsfChannels = "each",
-    search: Annotated[float, Option(help="How far to look for the scale, parts of one.")] = 0.06,
+    search: Annotated[
+        float, Option(help="Range of scales to search, as a fraction: 0.06 is ±6 %.")
+    ] = 0.06,
     refine: Annotated[
         Path | None,
-        Option(help="Write the PSF of the scale, turn and blur that fit best (.npy, .tif)."),
+        Option(help="Write the PSF with the scale, rotation and blur that fit best (.npy, .tif)."),
     ] = None,
 ) -> None:
-    """Tell whether a PSF is that of a capture, and refine it.
+    """Check that a PSF fits a capture, and refine it.
 
-    Tries other scales, turns and mirror images of it. The exit code is 1 if one of them fits
-    better, unless --refine has written it.
+    Tries other scales, rotations and mirror images. The exit code is 1 if one of them fits
+    better, unless --refine writes it.
     """
     with reported(lambda: "interrupted; nothing is known of the PSF"):
         from thincam_jax.commands.reconstruct import options
@@ -239,13 +268,13 @@ def check(
 
 
 def examine(
-    files: Annotated[list[Path], Argument(help="Captures of one camera.")],
-    psf: Annotated[Path | None, Option(help="Their measured PSF.")] = None,
+    files: Annotated[list[Path], Argument(help="Capture files of one camera.")],
+    psf: Annotated[Path | None, Option(help="Image of their measured PSF.")] = None,
     bits: Bits = None,
     bayer: Bayer = None,
     strict: Strict = False,
 ) -> None:
-    """Examine captures and a PSF for what spoils an image, without reconstructing any."""
+    """Look for faults in captures and their PSF."""
     with reported(lambda: "interrupted; nothing is known of the files"):
         from thincam_jax.measured import Preparation, read_image
         from thincam_jax.measured.examination import examine as examined

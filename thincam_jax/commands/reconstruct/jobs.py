@@ -28,7 +28,7 @@ from thincam_jax.measured.write import LINEAR
 class Job:
     """One capture and the images to be made of it; the record stands beside them as NAME.json.
 
-    - `focus`: which of the distances, where there are any; None: all that were before, as one
+    - `focus`: number of the distance, if there are several; None: all before, as one
       image that is sharp everywhere.
     - `label`: that distance, for messages.
     - `beside`: further files.
@@ -225,7 +225,7 @@ def _captures_in(folder: Path, sources: Sources) -> list[Path]:
 
 
 def _images(path: Path, output: Output) -> tuple[Path, ...]:
-    """The image files of a result that is asked for as `path`."""
+    """The image files of a result for the output `path`."""
     suffix = path.suffix.lower()
     if suffix in LINEAR:
         return (path,)

@@ -1,6 +1,7 @@
 """Options of a reconstruction: its files, its camera, its method, and what it writes."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +29,16 @@ DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 _LARGEST_TAU = 1e6
 
 Background = Path | float | int | Literal["corner", "found"] | None
+
+
+@contextlib.contextmanager
+def read_as(option: str = "", advice: str = "") -> Iterator[None]:
+    """ValueErrors as a MeasurementError that names the option, with advice in place of its text."""
+    try:
+        yield
+    except ValueError as error:
+        text = advice or str(error)
+        raise MeasurementError(f"{option}: {text}" if option else text) from None
 
 
 @dataclass(frozen=True)
@@ -81,7 +92,7 @@ class Recipe:
     - `method`: one of `PSF_METHODS`.
     - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most;
       None: as many as the method has by default.
-    - `coupling`: how colours share edges; None: "joint" for several channels.
+    - `coupling`: coupling of the colours' edges; None: "joint" for several channels.
     - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
       light to it.
     - `flip`: turn the image by 180°.
@@ -106,14 +117,11 @@ class Recipe:
 
     def __post_init__(self):
         self._check_method()
-        try:
+        with read_as():
             checks.non_negative("tau", self.relative_tau, "parts of one")
-            if self.ridge is not None:
-                checks.positive("ridge", self.ridge, "parts of one")
+            checks.positive("ridge", self.relative_ridge, "parts of one")
             if self.noise is not None:
                 checks.positive("noise", self.noise, "counts")
-        except ValueError as error:
-            raise MeasurementError(str(error)) from None
         if self.relative_tau > _LARGEST_TAU:
             raise MeasurementError(
                 f"tau = {self.relative_tau:g}: give about 1 to 3, at most {_LARGEST_TAU:g}"
@@ -178,7 +186,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Output:
-    """Where and how results are written.
+    """Files and formats of the results.
 
     - `path`: an image file; or a folder, in which each result has the name of its capture.
     - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
@@ -227,10 +235,8 @@ def known_psf(
             raise MeasurementError("--network is of a camera; give --camera in place of --psf")
         return psf[0] if len(psf) == 1 else tuple(psf), None
     assert camera is not None
-    try:
+    with read_as("--distance"):
         focused = None if distance is None else parse_quantity(distance, "length")
-    except ValueError as error:
-        raise MeasurementError(f"--distance: {error}") from None
     cameras = read_camera(camera, overrides or (), focused)
     focusing = None if network is None else read_network(network, cameras)
     return computed_psf(cameras, f"camera of {camera}"), focusing
@@ -238,10 +244,8 @@ def known_psf(
 
 def read_exposures(texts: Sequence[str], *counts: int) -> tuple[float, ...]:
     """Exposures, s, of so many files of PSF and capture; MeasurementError for another number."""
-    try:
+    with read_as("--exposure"):
         times = tuple(parse_quantity(text, "time") for text in texts)
-    except ValueError as error:
-        raise MeasurementError(f"--exposure: {error}") from None
     if times and len(times) != sum(n for n in counts if n > 1):
         text = f"--exposure is given {len(times)} times, for {counts[0]} --psf and {counts[1]}"
         text += " --capture; give one for each of what is given several times, the PSF's first"
@@ -260,11 +264,8 @@ def read_distances(text: str | None, psf: Sequence[Path]) -> tuple[float, ...]:
         raise MeasurementError(
             "--distances are those of measured PSFs; give them by one --psf, a folder or a TIFF"
         )
-    try:
-        distances = increasing([parse_quantity(part, "length") for part in text.split(",")])
-    except ValueError as error:
-        raise MeasurementError(f"--distances {text}: {error}") from None
-    return tuple(distances)
+    with read_as(f"--distances {text}"):
+        return tuple(increasing([parse_quantity(part, "length") for part in text.split(",")]))
 
 
 def read_corner(text: str) -> tuple[int, int]:
@@ -272,14 +273,10 @@ def read_corner(text: str) -> tuple[int, int]:
 
     **Errors**: MeasurementError for anything else.
     """
-    try:
+    with read_as(f"--corner {text}", "give the first pixel and the one after the last, as 5:15"):
         first, last = (int(part) for part in text.split(":"))
         if not 0 <= first < last:
             raise ValueError
-    except ValueError:
-        raise MeasurementError(
-            f"--corner {text}: give the first pixel and the one after the last, as 5:15"
-        ) from None
     return first, last
 
 
@@ -287,14 +284,10 @@ def read_crop(text: str | None) -> tuple[tuple[int, int], tuple[int, int]] | Non
     """The rows and the columns of the captures to use, from "100:740,200:1000"."""
     if text is None:
         return None
-    try:
+    advice = "give the first row and the one after the last, and the columns, as 100:740,200:1000"
+    with read_as(f"--crop {text}", advice):
         rows, columns = text.split(",")
         return read_corner(rows), read_corner(columns)
-    except (ValueError, MeasurementError):
-        raise MeasurementError(
-            f"--crop {text}: give the first row and the one after the last, and the columns, as "
-            "100:740,200:1000"
-        ) from None
 
 
 def read_white_balance(text: str | None) -> WhiteBalance:
@@ -306,13 +299,9 @@ def read_white_balance(text: str | None) -> WhiteBalance:
         return None
     if text.replace("-", "_") == "grey_world":
         return "grey_world"
-    try:
+    advice = "give grey-world, or the gains of red, green and blue as 1.8,1,1.4"
+    with read_as(f"--white-balance {text}", advice):
         red, green, blue = (float(part) for part in text.split(","))
-    except ValueError:
-        raise MeasurementError(
-            f"--white-balance {text}: give grey-world, or the gains of red, green and blue as "
-            "1.8,1,1.4"
-        ) from None
     return red, green, blue
 
 

@@ -278,7 +278,7 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
 def _focus(job: Job, ready: Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
     """The image of a network; its record is of the method alone."""
     from thincam_jax.learn.plot import draw_unsure
-    from thincam_jax.learn.refocusing.use import SURE, doubt, read
+    from thincam_jax.learn.refocusing.learned import SURE, doubt, read
     from thincam_jax.plot.frame import as_png
 
     began = time.perf_counter()
@@ -344,7 +344,7 @@ def check_files(
 ) -> tuple[list[str], bool]:
     """The lines that report `check_psf` of two files, and whether the PSF fits.
 
-    - `out`: where the refined PSF is written, on the pixels of the files.
+    - `out`: file for the refined PSF, on the pixels of the files.
     """
     if out is not None and out.suffix.lower() not in LINEAR:
         raise measured.MeasurementError(f"--refine {out}: give a file .npy or .tif")

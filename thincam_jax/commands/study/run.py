@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 
-from thincam_jax.commands.config_file import slug
+from thincam_jax._core.text import slug
 from thincam_jax.commands.report import (
     Gallery,
     Page,

@@ -23,16 +23,16 @@ _SCHEDULER_PARTS = ("dask", "distributed", "pyarrow")
 Grid = Annotated[
     list[str] | None,
     typer.Option(
-        help="a.b=lo:hi:n, a.b=lo:hi:n:log or a.b=v1,v2,… with the unit at the end; * for all "
-        "entries of a list. Once for each axis."
+        help="Values of one axis: a.b=lo:hi:n, a.b=lo:hi:n:log or a.b=v1,v2,…, with the unit at "
+        "the end; * for all entries of a list. Repeat it for further axes."
     ),
 ]
-Out = Annotated[Path | None, typer.Option(help="Folder of the results; default runs/NAME-sweep.")]
+Out = Annotated[Path | None, typer.Option(help="Folder of the results. Default: runs/NAME-sweep.")]
 Scheduler = Annotated[
-    str | None, typer.Option(help="Address of a dask scheduler, tcp://host:port.")
+    str | None, typer.Option(help="Address of a running dask scheduler, tcp://host:port.")
 ]
 Workers = Annotated[
-    int | None, typer.Option(help="Local worker processes; default: one for each core.")
+    int | None, typer.Option(help="Worker processes on this machine. Default: one for each core.")
 ]
 
 

@@ -220,7 +220,7 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 
 
 def _measured(run: Taker) -> tuple[CameraSettings, ...]:
-    """Camera settings nearest to the plan's; exposure and settle time measured where asked for."""
+    """Camera settings nearest to the plan's; exposure and settle time measured if wanted."""
     asked, wanted = run.plan.settings, run.procedure
     unknown = wanted.settle is None and run.rig.display.shape != Shutter.shape
     measured = unknown and not isinstance(run.rig.display, Shutter)

@@ -49,7 +49,7 @@ _SIZE = quantity("mm", positive=True, optional=True)
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Captures that a plan is asked for.
+    """Captures requested of a plan.
 
     - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
       `profile`, `phase`: width, profile and phase of all of them.
@@ -192,7 +192,7 @@ class PlanRequest:
 
         - `stage_zero`: distance at the stage's position 0, mm.
         - `shown`: levels of the pictures on the cells, uint8, by name.
-        - `mask`: where there are no `betas`.
+        - `mask`: mask of plans without `betas`.
         """
         dark = {"dark_frames": self.dark_frames}
         if self.kind == "alignment":

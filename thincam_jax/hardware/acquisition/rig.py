@@ -85,7 +85,7 @@ def open_rig(
     - `drivers`: name and options of the driver of the camera, the display and, if any, the stage.
     - `pitch`: pitch of the display's pixels, mm, for which zone plates are drawn.
     - `virtual`: simulated optics, whose virtual devices are opened in place of real ones.
-    - `pictures`: those of a plan of pictures or pixels, by name.
+    - `pictures`: pictures of a plan of pictures or pixels, by name.
     - `turns_phase`: the display is a phase modulator, which shows no black: someone covers the
       camera for dark frames.
 

@@ -133,7 +133,7 @@ class Procedure:
 class Taker:
     """The devices of a run and their known state.
 
-    - `steps`: those of the plan, each with its position, as any may be the first of this process.
+    - `steps`: steps of the plan, each with its position: any may be the first of this process.
     - `recovered`: the errors that a retry resolved. `seconds`: spent on each part of a step.
     """
 

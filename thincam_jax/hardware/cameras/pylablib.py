@@ -124,7 +124,7 @@ class PylablibCamera(Camera):
         return self._settings
 
     def _required(self, asked: CameraSettings) -> Region:
-        """Region asked for; OutOfRange for what pylablib's common interface does not set."""
+        """Region requested; OutOfRange for what pylablib's common interface does not set."""
         if asked.pixel_format not in _BITS:
             raise self._refused(f"no format {asked.pixel_format}", f"one of {', '.join(_BITS)}")
         given = asked.gain, asked.black_level, asked.trigger

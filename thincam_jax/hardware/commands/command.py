@@ -34,18 +34,17 @@ _CONFIG, _SECONDS = "config.yaml", "seconds.json"
 def capture(
     config: ConfigFile,
     out: Annotated[
-        Path | None, typer.Option(help="Store of the frames; default runs/NAME.zarr.")
+        Path | None, typer.Option(help="Store for the frames. Default: runs/NAME.zarr.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a store that is not complete.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an incomplete store.")] = False,
     set_: Overrides = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Take the frames of a plan with the devices of a rig, real or virtual.
+    """Take the frames of a plan with a rig.
 
-    Each frame is on the disk before it counts as taken: after Ctrl-C, an error of a device or a
-    power cut, --resume goes on. 'thincam run STORE' makes the image or the matrix of them.
+    The devices are real or virtual. Each frame is on the disk before it counts as taken: after
+    Ctrl-C, an error of a device or a power cut, --resume goes on. 'thincam run STORE' makes the
+    image or the matrix of them.
     """
     store = out or Path()
     kept = ""
@@ -56,9 +55,10 @@ def capture(
 
     with reported(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import write_whole
+        from thincam_jax._core.text import slug
         from thincam_jax.commands import run
         from thincam_jax.commands.checked_config import dump_config
-        from thincam_jax.commands.config_file import ConfigError, slug
+        from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.run_folder import to_json
         from thincam_jax.hardware.acquisition.acquire import acquire
@@ -104,9 +104,10 @@ def capture(
 def preview(
     config: ConfigFile, set_: Overrides = None, port: Port = 0, browser: Browser = True
 ) -> None:
-    """See what the camera of a rig sees, on a page in the browser: align, focus and expose.
+    """Show what the camera of a rig sees.
 
-    Turn exposure, gain, the pattern and the stage; k keeps a frame in frames/. Ctrl-C ends it.
+    Opens a page in the browser to align, focus and expose. Turn exposure, gain, the pattern and the
+    stage; k keeps a frame in frames/. Ctrl-C ends it.
     """
     with reported(lambda: "interrupted"):
         from thincam_jax.commands.kinds import load_experiment
@@ -136,8 +137,9 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
 
     **Errors**: ConfigError or MeasurementError, one line, for a folder that is no complete store.
     """
+    from thincam_jax._core.text import slug
     from thincam_jax.commands.checked_config import load_as
-    from thincam_jax.commands.config_file import ConfigError, slug
+    from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.commands.run_folder import RunFolder
     from thincam_jax.commands.terminal import counted
     from thincam_jax.hardware.commands.config import CaptureConfig

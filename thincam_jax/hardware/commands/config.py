@@ -124,7 +124,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
     - `electrons`: per second, of a pixel from each mm² of open aperture before a white scene; with
       a screen, of the brightest pixel before a white monitor.
     - `screen`: a see-through camera before a monitor, for a Hadamard plan.
-    - `monitor`: where it really stands, before a lensless camera.
+    - `monitor`: its true pose before a lensless camera.
     - `phase_levels`: true levels of a phase modulator; default those of the display.
     """
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from thincam_jax._core.table import Table
-from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax._core.text import slug
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.mask import MaskConfig, built_mask
 from thincam_jax.commands.pictures import published_figures
 from thincam_jax.commands.report import Page, Part, Picture

@@ -11,8 +11,8 @@ import skimage
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.hardware.acquisition.plan import Pattern, picture_digest
+from thincam_jax.lensless.masks.cells import AbstractCellMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.masks.redundant_arrays import AbstractCellMask
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 _HARMONICS = 99  # of a profile's series; the rest is less than a level

@@ -49,7 +49,7 @@ _STATUS = re.compile(
 
 @dataclass(frozen=True)
 class GrblMessage:
-    """One line of GRBL; its kind decides which fields are set."""
+    """One line of GRBL; its kind decides which attributes are set."""
 
     kind: Kind
     number: int = 0  # of the error, the alarm or the setting

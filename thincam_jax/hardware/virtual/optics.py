@@ -106,7 +106,7 @@ class ModulatorOptics:
                     fill_factor=self.fill_factor,
                     gap=0.0 if self.phases is None else self.phases.gap,
                 )
-                for wavelength, weight in zip(spectrum.wavelengths, spectrum.weights, strict=True)
+                for wavelength, weight in spectrum.colours
             ]
             kernel = functools.reduce(jnp.add, kernels)
             convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)
@@ -354,7 +354,7 @@ def cells_seen(
 
 @dataclass(frozen=True)
 class MonitorPose:
-    """Where a monitor stands, beside the middle of the object's plane.
+    """Pose of a monitor about the middle of the object's plane.
 
     - `x`, `y`, `z`: place of its middle, mm; z is away from the camera.
     - `rotation`: clockwise as seen; `turn`: its right side, `tilt`: its lower side is farther.

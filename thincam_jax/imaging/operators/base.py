@@ -52,7 +52,7 @@ class AbstractOperator(AnyRank):
         r"""The largest singular value ‖A‖, by power iteration on AᵀA.
 
         It is approached from below: after 30 iterations to a few per cent where singular values
-        crowd at the top, to all digits where the largest is isolated. A step of a gradient method
+        crowd at the top, to all digits where the largest is isolated. A gradient step
         should keep a margin. `dtype`: type of the iteration, by default that of the operator's
         numbers.
         """

@@ -34,7 +34,7 @@ class CropConvolution(AbstractOperator):
       that of `kernel_shape` or differ from it by even numbers.
     - `pitch`: Δ, mm.
     - `sensor_shape`, `field_shape`: (rows, columns).
-    - `summed`: how many axes of the kernel before its last two are summed over. Those before
+    - `summed`: number of the kernel's axes before its last two that are summed over. Those before
       them are channels: each of the field's convolved with its own. A channel axis of length 1
       is one PSF for any number of channels.
     - `window`: shape of the transforms, at least `window_shape(…)`, the default.

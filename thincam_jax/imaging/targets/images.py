@@ -107,7 +107,10 @@ def _read_other(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
         if file.mode in ("CMYK", "P") and file.format in ("JPEG", "TIFF"):
             turned = file.format == "TIFF"  # by Pillow
             return np.asarray(file.convert("RGB")), tags, 1 if turned else orientation
-    if data[:4] == b"\x89PNG" and png_header(data)[2:4] in ((16, 2), (16, 6)):
+        deep = data[:4] == b"\x89PNG" and png_header(data)[2:4] in ((16, 2), (16, 6))
+        if file.mode in ("L", "RGB") and not deep:
+            return np.asarray(file), tags, orientation
+    if deep:
         with contextlib.suppress(ImportError):  # without, 8 of the 16 bits
             import imagecodecs
 

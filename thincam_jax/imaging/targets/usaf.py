@@ -96,7 +96,7 @@ def usaf1951(
     """The chart as an image in [0, 1], centred, each pixel holding its exact area coverage.
 
     - `shape`: (rows, columns) of the image.
-    - `layers`: how many pairs of groups; the n-th layer's bars are 4^(1−n) as wide as the first's.
+    - `layers`: number of pairs of groups; the n-th layer's bars are 4^(1−n) as wide as the first's.
     - `polarity`: "bright_on_dark" for bright bars, or its negative "dark_on_bright".
     - `pixels_per_chart`: side of the square chart in pixels; by default the smaller side of
       `shape`. What does not fit into the image is cut off.

@@ -13,18 +13,18 @@ if TYPE_CHECKING:
 
 def train(
     config: Annotated[
-        Path, typer.Argument(help="Experiment file (YAML) of kind learned or denoiser.")
+        Path, typer.Argument(help="Experiment file (YAML) of kind 'learned' or 'denoiser'.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default runs/NAME of the network.")
+        Path | None, typer.Option(help="Folder of the results. Default: runs/NAME.")
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training that the folder holds.")
+        bool, typer.Option("--resume", help="Continue the training in the folder.")
     ] = False,
     set_: Overrides = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Train a network that refocuses the captures of a camera, or a denoiser.
+    """Train a refocusing network or a denoiser.
 
     Writes network.thincam, figures and training.json. Ctrl-C, or a power cut, loses what was done
     since the last check; --resume goes on from there, to the same numbers.

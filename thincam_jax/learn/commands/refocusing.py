@@ -25,11 +25,11 @@ from thincam_jax.learn.commands.training import (
 )
 from thincam_jax.learn.refocusing import sources
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.learned import RefocusTraining, finite, judge_training
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import SceneOptions
 from thincam_jax.learn.refocusing.train import NETWORK, Lessons, train
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.refocusing.use import RefocusTraining, finite, judge_training
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture

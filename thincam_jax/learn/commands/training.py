@@ -96,7 +96,7 @@ class InFolder:
     resume: bool = False
 
     def check(self, config: Any) -> None:
-        """**Errors**: ConfigError where the folder has a state and `resume` is not asked for, or
+        """**Errors**: ConfigError where the folder has a state and `resume` is False, or
         the other way round, and where the state came from other inputs."""
         path = self.folder.path
         begun = any(path.glob("training*.state"))

@@ -89,7 +89,7 @@ def _pictures(image: np.ndarray, entry: Entry) -> Pictures:
 
 
 def _places(side: int) -> list[int]:
-    """Where tiles begin that cover a side evenly."""
+    """First pixels of tiles that cover a side evenly."""
     return np.linspace(0, side - TILE, -(-side // TILE)).round().astype(int).tolist()
 
 

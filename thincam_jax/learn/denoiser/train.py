@@ -46,7 +46,7 @@ class DenoisingLessons:
     - `pictures`: pictures of each step; `held_out`: those that judge the network, which no step
       sees; by default the same.
     - `batch`: crops of a step; `crop`: pixels of their sides; `judged`: batches of a check.
-    - `cameras`: how many are drawn, behind which the network learns inside the steps of
+    - `cameras`: number of drawn cameras, behind which the network learns inside the steps of
       `PlugAndPlay`, too; 0: none.
     """
 

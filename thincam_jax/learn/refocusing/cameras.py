@@ -27,7 +27,7 @@ _MARGIN = 8
 
 
 class Stand(eqx.Module):
-    """Where the planes of a stack stand, one of them at a commanded distance.
+    """Distances of the planes of a stack, one of them at a commanded distance.
 
     - `inverse`: 1/t, 1/mm, the nearest first; `number`: index of the commanded plane.
     - `place`: 1 where a plane stands among the places relative to the commanded one, which is the
@@ -51,7 +51,7 @@ class Stand(eqx.Module):
 
 @checked
 class RefocusCamera(eqx.Module):
-    """A camera, its light, its image and the range of distances on which it is to be focused.
+    """A camera, its light, its image and the range of its distances.
 
     - `camera`: mask, sensor and the distance d between them.
     - `light`: a `Spectrum` or one wavelength in mm.
@@ -176,7 +176,7 @@ class RefocusCamera(eqx.Module):
         """The PSFs at these distances, mm, on `support` pixels."""
         grid = self.camera.sensor.grid.with_shape(self.support)
         method = PsfMethod(self.model, pixel_integration=True)
-        light = list(zip(self.light.wavelengths, self.light.weights, strict=True))
+        light = self.light.colours
         return jax.vmap(lambda t: spectral_psf(self.camera, light, t, method, grid))(distances)
 
     def _support(self) -> tuple[int, int]:

@@ -126,7 +126,7 @@ class Weights(eqx.Module):
     """The numbers of each step.
 
     - `joint`: the linear step of all planes, by their places relative to the commanded distance.
-    - `alone`: that of the plane at the commanded distance, as if nothing stood elsewhere.
+    - `alone`: image of the plane at the commanded distance, as if nothing stood elsewhere.
     - `prior`: the U-Net; all that is learnt.
     """
 

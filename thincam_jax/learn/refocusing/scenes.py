@@ -173,7 +173,7 @@ class LayeredScene(eqx.Module):
 
     @property
     def visible(self) -> Float[Array, "layer y x"]:
-        """Share of each layer in what a pinhole in the middle of the mask sees."""
+        """Share of each layer in the view of a pinhole in the middle of the mask."""
         return self.cover * _seen_past(self.cover)
 
     @property
@@ -215,7 +215,7 @@ class LayeredScene(eqx.Module):
 
 
 class Batch(eqx.Module):
-    """Scenes, their captures, and what is to be made of them; a single one has no axis of elements.
+    """Scenes, their captures, and the targets of a network; a single one has no axis of elements.
 
     - `capture`: (element, y, x), in the camera's units.
     - `deviation`: root mean square of the noise per pixel, the same units.

@@ -26,7 +26,7 @@ _ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
 
 
 def described(value: Any) -> Any:
-    """Every number of a module as JSON, by the names of its fields."""
+    """Every number of a module as JSON, by the names of its attributes."""
     if isinstance(value, eqx.Module):
         fields = (field.name for field in dataclasses.fields(value))
         numbers = {name: described(getattr(value, name)) for name in fields}
@@ -82,7 +82,7 @@ def _as_trained(name: str, there: dict[str, Any], cameras) -> RefocusCamera:
 
 
 def _optical(camera: Any) -> Any:
-    """A description without what a sensor makes of the light."""
+    """A description without the sensor's exposure, full well and bits."""
     if not isinstance(camera, dict):
         return camera
     return {name: _optical(value) for name, value in camera.items() if name not in _ELECTRONIC}

@@ -111,7 +111,7 @@ def _richardson(
     psf_of: Callable[[PsfMethod], Float[Array, "y x"]],
     norm: Callable[[Float[Array, "y x"]], Float[Array, ""] | float],
 ) -> Iterator[tuple[PsfMethod, float]]:
-    """Each method but the finest, and its error predicted from the next one's PSF."""
+    """All settings but the finest, with the error predicted from the PSF of the next."""
     before = psf_of(methods[0])
     for method, finer in zip(methods, methods[1:], strict=False):
         after = psf_of(finer)

@@ -14,7 +14,7 @@ from thincam_jax._core.memory import available_bytes
 from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, precision_of
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.accuracy.sampled import sampled_errors
-from thincam_jax.lensless.camera import LenslessCamera, require_off_axis
+from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, has_few_terms
 from thincam_jax.lensless.method import (
     SAMPLED,
@@ -24,9 +24,10 @@ from thincam_jax.lensless.method import (
     models_of,
     parts_of,
     psf_method,
+    sampled_off_axis,
 )
 from thincam_jax.lensless.propagation.skew import corner_error
-from thincam_jax.lensless.resolve import Cost, held_in_single, psf_cost, sampled_off_axis
+from thincam_jax.lensless.resolve import Cost, held_in_single, psf_cost, require_off_axis
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.

@@ -134,7 +134,7 @@ class FresnelZoneAperture(AbstractFactoredMask):
     @property
     def finest_frequency(self) -> Float[Array, ""]:
         """Local zone frequency at the middle of the farther edges, cycles/mm."""
-        return edge_frequency(self.beta, jnp.maximum(*self.extent))
+        return _finest_frequency(self.beta, *self.extent)
 
     @property
     def orders(self) -> tuple[int, ...]:
@@ -193,6 +193,11 @@ class FresnelZoneAperture(AbstractFactoredMask):
 def edge_frequency(beta: Any, width: Any) -> Any:
     """Zone frequency β·width/(2π) at an aperture's edge, cycles/mm: d(βr²)/dr = 2πf there."""
     return beta * width / (2 * np.pi)
+
+
+@jax.jit
+def _finest_frequency(beta, height, width) -> Float[Array, ""]:
+    return edge_frequency(beta, jnp.maximum(height, width))
 
 
 def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float, ...]]:

@@ -23,7 +23,7 @@ from thincam_jax.lensless.masks.base import (
     Transmittance,
     open_parts,
 )
-from thincam_jax.lensless.masks.redundant_arrays import cell_edges
+from thincam_jax.lensless.masks.cells import cell_edges
 
 _WIDEST = 1000.0  # mm, of a mask from an image
 

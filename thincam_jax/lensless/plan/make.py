@@ -60,13 +60,8 @@ class _Change:
     powers: Complex[np.ndarray, "2 4 k"]
 
 
-def knows_field(seen: SeenScene) -> bool:
-    """Whether the model has the mask's PSF along the field's axes: of all but rings."""
-    return seen.camera.mask.exact_model != "radial"
-
-
 def choose_field(seen: SeenScene, method: PsfMethod, tolerance: float) -> tuple[PsfMethod, float]:
-    """The method with the PSF and the light of the axis, the light or both of every point.
+    """The model with the PSF and light of the axis, or with the light or both of every point.
 
     The first that is within the tolerance.
     """
@@ -91,7 +86,7 @@ def choose_field(seen: SeenScene, method: PsfMethod, tolerance: float) -> tuple[
 
 
 def _own(seen: SeenScene, method: PsfMethod, share: float) -> tuple[PsfMethod, float]:
-    """The method of every point's own PSF, and its relative error; infinite of lenses."""
+    """The model with each point's own PSF, and its relative error; infinite for lenses."""
     mask = seen.camera.mask
     if zone_orders(mask) is not None:
         share = min(max(share, _SMALLEST), _LARGEST)
@@ -208,7 +203,7 @@ def plan_capture(
     seen = SeenScene(camera, scene, tolerance)
     method, model_error = choose_psf(seen, tolerance * _MODEL_SHARE)
     model_error += RESULT_ROUNDING[precision_of(camera.sensor.pitch)]
-    field_error, over_field = 0.0, over_field and knows_field(seen)
+    field_error, over_field = 0.0, over_field and camera.mask.exact_model != "radial"
     if over_field:
         method, field_error = choose_field(seen, method, tolerance * _FIELD_SHARE)
     left = max(tolerance - model_error - field_error, 0.0)

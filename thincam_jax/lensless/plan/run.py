@@ -121,10 +121,10 @@ class CapturePlan:
     it was made for and images like its, and for cameras within 1 % of its own, at any phase of the
     mask.
 
-    - `camera`: that it was made for.
+    - `camera`: camera of the plan.
     - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
       batch as a whole.
-    - `method`: method of the PSFs, which `psf` takes.
+    - `method`: model of the PSFs with its settings, which `psf` takes.
     - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
     - `mixing`: (distance, plane) weights: the PSF of a plane is this sum of the computed ones, so
       that planes are merged before they are convolved.

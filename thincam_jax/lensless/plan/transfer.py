@@ -115,7 +115,7 @@ class TransferProbe:
         method: PsfMethod,
         at: tuple[float, float] | None = None,
     ) -> Complex[np.ndarray, " k"]:
-        """H with factors in the method's precision, transformed in double precision.
+        """H with factors in the model's precision, transformed in double precision.
 
         `at`: a point on one of the mask's axes; H is then about the middle of its shadow.
         """
@@ -138,7 +138,7 @@ class TransferProbe:
         method: PsfMethod,
         at: tuple[float, float] | None = None,
     ) -> Complex[np.ndarray, " k"]:
-        """H in single precision, with the method's nodes a pixel, for many PSFs."""
+        """H in single precision, with the nodes a pixel of `method`, for many PSFs."""
         method = replace(method, precision="float32")
         return self._transfer(self._single_waves, self._path(wavelength, distance, at), method)
 

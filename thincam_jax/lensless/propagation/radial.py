@@ -14,7 +14,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, flat_root, phasor, squared_modulus
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, other_models
-from thincam_jax.lensless.masks.pinhole import RadialMask
+from thincam_jax.lensless.masks.openings import RadialMask
 from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod
 from thincam_jax.lensless.propagation.chirp import edge_wave
 from thincam_jax.lensless.propagation.separable import pixel_mean

@@ -35,7 +35,7 @@ class SeparableSum(eqx.Module):
 
     - `rows`: Y_m on the rows, with all constant factors.
     - `columns`: X_m on the columns.
-    - `grid`: where the samples lie.
+    - `grid`: grid of the samples.
     """
 
     rows: Complex[Array, "term y"]

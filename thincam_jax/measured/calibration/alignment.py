@@ -79,7 +79,7 @@ class Alignment:
     - `unknowns`, `covariance`: parameters and their covariance, of a similarity a, b, x, y, for (x
       + a u − b v, y + b u + a v); of a homography its first eight entries, row by row. u, v: mm
       from the display's middle.
-    - `marks`, `used`: that were shown; that agree with the map.
+    - `marks`, `used`: number of marks shown, and of those that agree with the map.
     - `residual`: root mean square distance of these from the map, mm.
     """
 

@@ -69,7 +69,7 @@ class FitState(eqx.Module):
     """All parameters of the image of a point source on the axis.
 
     - `nearness`: 1/t, 1/mm; 0 is a plane wave. Unlike t, it is differentiable at infinity.
-    - `synthesis`: how several captures are summed; None for one capture.
+    - `synthesis`: sum of several captures; None for one capture.
     - `nodes`: nodes of the average over a pixel; known numbers decide, which here are traced.
     """
 

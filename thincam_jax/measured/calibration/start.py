@@ -28,11 +28,11 @@ _WIDEST = 0.5  # relative search range
 class PsfSearch:
     """Numbers that `fit_psf` fits, how far from the camera given, and by which model.
 
-    - `parameters`: which to fit, of "beta", "phase", "centre", "width", "distance",
+    - `parameters`: numbers to fit, of "beta", "phase", "centre", "width", "distance",
       "object_distance", "wavelength", "background", "gain"; the others are held. Without
       "background" it is 0, without "gain" 1.
-    - `relative`: how far β, d and λ may be from their start, in parts of one.
-    - `centre`: how far the centre may be, along y and x, on the sensor, mm; by default a tenth of
+    - `relative`: largest relative change of β, d and λ from their start.
+    - `centre`: largest shift of the centre along y and x on the sensor, mm; by default a tenth of
       the sensor's shorter side.
     - `pixel_integration`: average h over each pixel, as a sensor does. Without, the waves from the
       far rim, up to 10 turns a pixel, are aliased, and d is then only as good as the start.

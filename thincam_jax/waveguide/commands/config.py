@@ -62,7 +62,7 @@ class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
 
 
 class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
-    """Where a hologram is: its size, and its middle from the camera's axis, y downwards."""
+    """Size of a hologram, and its middle from the camera's axis, y downwards."""
 
     height: Length
 

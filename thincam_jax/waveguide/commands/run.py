@@ -8,7 +8,8 @@ import numpy as np
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.memory import peak_memory, readable
-from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax._core.text import slug
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.pictures import published_figures
 from thincam_jax.commands.report import Content, Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder

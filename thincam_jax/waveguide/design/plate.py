@@ -94,7 +94,7 @@ class PlateLimits(eqx.Module):
     upper: Plate
 
     def plate(self, point: Float[Array, "6"]) -> Plate:
-        """Plate at a point of the unit cube, its axes in the order of the fields of `Plate`."""
+        """Plate at a point of the unit cube, its axes in the order of the attributes of `Plate`."""
         low, high = (jnp.stack(jax.tree.leaves(end)) for end in (self.lower, self.upper))
         values = low + point.astype(low.dtype) * (high - low)
         return jax.tree.unflatten(jax.tree.structure(self.lower), list(values))

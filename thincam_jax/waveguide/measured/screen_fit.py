@@ -65,7 +65,7 @@ _PLACES = {
 }
 _FIELDS = quantities(VolumeHologram, Screen, SeeThroughCamera, ObjectPlane)
 _FIELD_OF = {"slant": "tilt"} | {n: path.rpartition(".")[2] for n, (path, _) in _PLACES.items()}
-# Quantity of the field that each parameter is; ratios have no unit.
+# Quantity of the attribute that each parameter is; ratios have no unit.
 QUANTITIES = {name: _FIELDS.get(_FIELD_OF.get(name, name), unchecked()) for name in PARAMETERS}
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
 

@@ -69,7 +69,7 @@ class ScreenMask:
     The camera's `focal_distance` is from the sensor to the mask, its `lens_distance` from the mask
     to the plate. Captures are irradiances relative to the open aperture, summed over it: mm².
 
-    - `mask`: whose middle is on the axis.
+    - `mask`: mask with its middle on the axis.
     - `model`: model of its PSFs, averaged over pixels; see `psf`.
     - `points`: along each side of the field, an odd number, at which they are computed.
     - `tolerance`: error of the sum of convolutions that is allowed, relative to the PSFs at these

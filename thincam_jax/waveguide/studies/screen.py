@@ -396,8 +396,8 @@ class ScreenRun:
 class RaySummary:
     """Least and largest values over the field, and how rays ended, in per cent by status.
 
-    - `first_ghost_down_mm`, `first_ghost_right_mm`: how much further a pixel sees by it. None where
-      there is one order only, or no ray.
+    - `first_ghost_down_mm`, `first_ghost_right_mm`: displacement of what a pixel sees by it. None
+      where there is one order only, or no ray.
     """
 
     wavelength_nm: tuple[float, float] | None

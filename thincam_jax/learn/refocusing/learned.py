@@ -121,7 +121,7 @@ class Learned(AbstractSolver):
     def solve(self, recording: Recording) -> Reconstruction:
         began, model = time.perf_counter(), recording.imaging_model
         if not isinstance(model, Cameras):
-            raise ValueError("a learned method knows its camera; give a recording by tc.Cameras")
+            raise ValueError("a network belongs to a camera; give a recording by tc.Cameras")
         network = RefocusNetwork.load(SHIPPED, model) if self.network is None else self.network
         camera = network.camera
         same_camera("the network", described(camera), model)

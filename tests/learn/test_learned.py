@@ -17,11 +17,11 @@ import thincam_jax as tc
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.learn.checkpoint import CheckpointError, network_description, write_arrays
 from thincam_jax.learn.commands.refocusing import LearnedConfig, build_camera
+from thincam_jax.learn.refocusing.learned import Learned, doubt
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.sources import as_json, dead_leaves
 from thincam_jax.learn.refocusing.store import KIND, SHIPPED, SHIPPED_FILE
 from thincam_jax.learn.refocusing.train import NETWORK, STATE, train
-from thincam_jax.learn.refocusing.use import Learned, doubt
 from thincam_jax.units import nm
 
 

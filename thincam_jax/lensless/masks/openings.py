@@ -18,7 +18,7 @@ from thincam_jax.lensless.masks.base import (
     AxisFactors,
     MaskTerms,
 )
-from thincam_jax.lensless.masks.redundant_arrays import cell_edges
+from thincam_jax.lensless.masks.cells import cell_edges
 
 
 class Pinhole(AbstractFactoredMask):
