@@ -284,7 +284,7 @@ CALIBRATIONS = (
     ),
     call(calibrate_separable, rows=TWO, columns=TWO, shown="stripes"),
     call(
-        tc.fit_separable,
+        tc.measured.calibration.fit_separable,
         images=RANDOM.random((4, 9, 12)),
         captures=RANDOM.random((4, 12, 15)),
         start=call(Separable, left=RANDOM.random((12, 9)), right=RANDOM.random((15, 12))),

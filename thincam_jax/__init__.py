@@ -9,7 +9,7 @@
 
 Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)` explains one name.
 
-- cameras: `LenslessCamera`, `Sensor`; `waveguide.SeeThroughCamera`
+- cameras: `LenslessCamera`, `Mosaic`, `Sensor`; `waveguide.SeeThroughCamera`
 - masks: `FresnelZoneAperture`, `ModifiedUniformlyRedundantArray`, `SeparableMask`, `Pinhole`,
   `RadialMask`, `LensletArray`, `PhaseMask`, `SampledMask`; own ones by
   `lensless.masks.AbstractFactoredMask`
@@ -19,7 +19,7 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
 - accuracy: `choose_model`, `predict_error`, `plan_capture`, `PsfMethod`
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
   `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV`, `PlugAndPlay` or `Learned`; `Stream`
-- calibration: `fit_psf`, `check_psf`, `refine`, `fit_separable`, `measured`
+- calibration: `fit_psf`, `check_psf`, `refine`, `measured`
 - experiments: `studies`, `design`, `learn`, `plot`, `explore`, `hardware`
 
 The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes a second to import,

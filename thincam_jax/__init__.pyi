@@ -37,13 +37,13 @@ from .lensless.masks.phase import PhaseMask as PhaseMask
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import PsfMethod as PsfMethod
+from .lensless.mosaic import Mosaic as Mosaic
 from .lensless.plan.make import plan_capture as plan_capture
 from .lensless.psf import mtf as mtf
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
 from .lensless.separable_operator import separable_operator as separable_operator
 from .measured.calibration.psf_fit import fit_psf as fit_psf
-from .measured.calibration.separable import fit_separable as fit_separable
 from .plot.page import explore as explore
 from .reconstruction.fringe_filter import FringeScanning as FringeScanning
 from .reconstruction.imaging_model import Cameras as Cameras

@@ -217,3 +217,19 @@ def test_down_in_the_image_is_minus_y(tmp_path):
     _, triangles = triangles_of(write_stl(tmp_path / "m.stl", tc.PhaseMask(height, 1 * um, 1.5)))
     high = triangles[triangles[..., 2] > 0.1005]
     assert (high[:, 0] > 0.9 * um).all() and (high[:, 1] > 0.4 * um).all()
+
+
+def test_a_mosaic_is_one_layout(tmp_path):
+    """Each mask where the mosaic has it; both tones fill the rectangle about all."""
+    masks = [[MASKS["zones"].replace(phase=phase, centre=(0.0, 0.0)) for phase in (0.0, 1.5)]]
+    mosaic = tc.Mosaic(masks, tc.Sensor((40, 70), 20 * um), 2.0, pitch=0.6, wall=0.05)
+    region = read(tc.design.write_gds(tmp_path / "two.gds", mosaic))
+    for mask, x in zip(masks[0], (-0.3, 0.3), strict=True):
+        alone = read(tc.design.write_gds(tmp_path / "one.gds", mask.replace(centre=(0.0, x))))
+        box = klayout.db.Region(
+            klayout.db.Box(*(round(1e6 * n) for n in (x - 0.26, -1, x + 0.26, 1)))
+        )
+        assert ((region & box) ^ alone).area() < 1e-4 * alone.area()
+    dark = read(tc.design.write_gds(tmp_path / "dark.gds", mosaic, tone="opaque"))
+    assert (region & dark).area() < 1e-4 * dark.area()
+    assert (region + dark).area() * 1e-12 == pytest.approx(1.1 * 0.4, rel=1e-4)

@@ -76,6 +76,31 @@ def test_solvers_by_name():
             tc.reconstruct(recording, given)
 
 
+def test_a_mosaic_is_recorded_in_one_frame():
+    """Its parts' PSFs hold the parallax: without their places near objects come out doubled."""
+    phases = (0.0, 90 * deg), (180 * deg, 270 * deg)
+    masks = [[tc.FresnelZoneAperture(40.0, p, width=1.4) for p in row] for row in phases]
+    one = tc.Mosaic(masks, tc.Sensor((148, 170), 20 * um), 4.0, wall=0.05)
+    seen = scene(width=15.0, distance=60.0)
+    recording = tc.record(one, seen, noise=40.0, key=1)
+    frame = tc.capture(one, seen, noise=tc.GaussianNoise(40.0), key=1)
+    for part, capture in zip(one.split(frame), recording.captures, strict=True):
+        np.testing.assert_array_equal(part, capture)
+    variance = float(tc.GaussianNoise(40.0).variance(frame))
+    np.testing.assert_allclose(recording.noise_variance, [variance] * 4, rtol=1e-5)
+    optics = recording.imaging_model
+    alone = [camera.replace(place=None) for camera in optics.cameras]
+    unregistered = recording.replace(imaging_model=optics.replace(cameras=alone))
+    for solver in (tc.FringeScanning(), tc.Wiener()):
+        found = []
+        for given in (recording, unregistered):
+            image = tc.reconstruct(given, solver).image
+            grid = tc.Grid(image.shape, optics.pitch)
+            truth = seen.planes[0].sample(grid, magnification=1.0)
+            found.append(tc.imaging.metrics.psnr(np.asarray(image), np.asarray(truth)))
+        assert found[0] > found[1] + 1.0
+
+
 FOUR = [ZONES[0].replace(mask=ZONES[0].mask.replace(phase=n * 90 * deg)) for n in range(4)]
 MURA = tc.LenslessCamera(tc.ModifiedUniformlyRedundantArray(11, 120 * um), SENSOR, distance=3.0)
 COLOURS = np.stack([PICTURE, PICTURE[::-1], PICTURE[:, ::-1]])

@@ -22,7 +22,7 @@ from thincam_jax.commands.schema import (
 )
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.imaging.targets.images import sample_images
-from thincam_jax.lensless.exposures import PAIR, QUARTERS, Exposures
+from thincam_jax.lensless.exposures import PAIR, QUARTERS, Exposures, Layout
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction import TotalVariation
@@ -117,6 +117,10 @@ class VariationConfig(section(AdmmTV, TotalVariation, **_VARIATION)):
     """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
 
+class MosaicConfig(section(Layout)):
+    """Masks side by side on one sensor, exposed together; see `thincam_jax.Mosaic`."""
+
+
 MethodKind = Literal["fringe_scanning", "wiener", "admm_tv", "pnp"]
 # The mask phases taken at each shot, rad, where the synthesis sets them.
 PHASES = {"fringe_scanning": QUARTERS, "phase_pairs": PAIR}
@@ -125,6 +129,7 @@ PHASES = {"fringe_scanning": QUARTERS, "phase_pairs": PAIR}
 class MethodConfig(Section):
     """A reconstruction and the captures that it takes.
 
+    - `mosaic`: takes all captures in one exposure, each on a part of the sensor.
     - `steps`, `harmonics`: number of phases of a turn that the synthesis harmonics takes at each
       shot, and the m that it keeps.
     """
@@ -137,6 +142,7 @@ class MethodConfig(Section):
     phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
     steps: Annotated[int, Field(ge=3, le=64)] = 8
     harmonics: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    mosaic: MosaicConfig | None = None
     published: PublishedConfig = PublishedConfig()
 
     @pydantic.model_validator(mode="after")
@@ -366,6 +372,11 @@ def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
         take=[shot.take or 1 for shot in shots],
     )
     exposures = settings.at_phases(phases)
+    if method.mosaic is not None:
+        try:
+            exposures = exposures.at_once(method.mosaic.build())
+        except ValueError as error:
+            raise FieldError(str(error), "mosaic") from None
     return exposures.of_moving(config.motion) if config.motion else exposures
 
 

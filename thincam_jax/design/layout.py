@@ -15,6 +15,7 @@ from thincam_jax._core.quantity import choice, quantity, whole
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.masks.openings import RadialMask
+from thincam_jax.lensless.mosaic import Mosaic
 
 Tone = Literal["open", "opaque"]
 TONES: tuple[Tone, ...] = get_args(Tone)
@@ -25,7 +26,7 @@ _MICROMETRES, _CHORD, _UNIT = 1e3, 0.01, 1e-3
 @checked
 def write_gds(
     path: str | os.PathLike[str],
-    mask: AbstractMask,
+    mask: AbstractMask | Mosaic,
     *,
     tone: Annotated[Tone, choice(TONES)] = "open",
     layer: Annotated[int, whole(0, 255)] = 1,
@@ -37,7 +38,8 @@ def write_gds(
     Masks of cells that are open or closed (`SampledMask`, MURA, URA, separable, `Pinhole`), rings
     (`RadialMask`) and the binary `FresnelZoneAperture`, whose zones are cut off by its sides as
     they are, without the Fourier series of the model. x points right and y up: rows of the mask
-    run downwards, as in its picture. Circles are polygons within 10 nm.
+    run downwards, as in its picture. Circles are polygons within 10 nm. A `Mosaic` is one layout of
+    all its masks at their places.
 
     **Arguments**
 
@@ -67,8 +69,10 @@ def write_gds(
     path = Path(path)
     if path.suffix.lower() != ".gds":
         raise ValueError(f"{path}: layouts are written as .gds; give this suffix")
-    zones = _zones(mask)
-    parts, finest = _cells(gdstk, mask) if zones is None else _rings(gdstk, mask, *zones)
+    masks = mask.placed if isinstance(mask, Mosaic) else (mask,)
+    drawings = [_drawing(gdstk, one) for one in masks]
+    parts = [part for drawn, _ in drawings for part in drawn]
+    finest = min(width for _, width in drawings)
     least = 0.0 if smallest_feature is None else float(np.asarray(smallest_feature))
     if finest < least * (1 - 1e-6):
         raise ValueError(
@@ -76,7 +80,9 @@ def write_gds(
             f"or smallest_feature of at most {finest:.3g} mm"
         )
     if tone == "opaque":
-        parts = gdstk.boolean(_frame(gdstk, mask), parts, "not", precision=_UNIT)
+        corners = np.stack([_frame(gdstk, one).bounding_box() for one in masks])
+        whole = gdstk.rectangle(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
+        parts = gdstk.boolean(whole, parts, "not", precision=_UNIT)
     library = gdstk.Library(unit=1e-6, precision=1e-9)
     drawn = library.new_cell(cell)
     for part in parts:
@@ -86,6 +92,12 @@ def write_gds(
         written = Path(folder) / path.name
         library.write_gds(written)
         return write_whole(path, read_regular(written))
+
+
+def _drawing(gdstk: Any, mask: AbstractMask) -> tuple[list, float]:
+    """Polygons of the open parts, and the finest part, mm."""
+    zones = _zones(mask)
+    return _cells(gdstk, mask) if zones is None else _rings(gdstk, mask, *zones)
 
 
 def _frame(gdstk: Any, mask: AbstractMask) -> Any:

@@ -84,6 +84,31 @@ def method_b(
 
 
 @checked
+def mosaic(
+    masks: Sequence[Pattern],
+    rows: int,
+    columns: int,
+    pitch: float,
+    settings: CameraSettings,
+    *,
+    dark_frames: int = 0,
+) -> AcquisitionPlan:
+    """One capture of several zone plates side by side, see `Mosaic`.
+
+    - `masks`: `zone_plate`s of one width and profile, row by row.
+    - `pitch`: distance of their middles, mm.
+    """
+    numbers: dict[str, float | int | str] = {"rows": rows, "columns": columns, "pitch": pitch}
+    for number, mask in enumerate(masks):
+        numbers |= {
+            f"beta {number}": mask.numbers["beta"],
+            f"phase {number}": mask.numbers["phase"],
+        }
+    numbers |= {name: masks[0].numbers[name] for name in ("width", "profile")}
+    return _plan("mosaic", [(Pattern("mosaic", numbers), None)], settings, dark_frames)
+
+
+@checked
 def psf_stack(
     mask: Pattern,
     depths: Sequence[float],

@@ -46,6 +46,7 @@ class LightPath(Module):
     - `skew`: whether the point is, or may be, off both of the mask's axes.
     - `follows`: whether the middle of the sensor's samples is where the ray through the mask's
       plane at (0, 0) meets it, in place of the axis.
+    - `place`: (y, x) of the camera's axis in the frame of `at`, mm: a point is seen from there.
     """
 
     wavelength: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.wavelength))
@@ -59,6 +60,7 @@ class LightPath(Module):
     sine: Float[Array, ""] | None = None
     skew: bool = eqx.field(default=False, static=True)
     follows: bool = eqx.field(default=False, static=True)
+    place: Float[Array, "2"] | None = None
 
     @property
     def magnification(self) -> Float[Array, ""]:
@@ -97,7 +99,7 @@ class LightPath(Module):
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"]]:
         """Rows and columns of the sensor on the mask's scale, from the middle of its shadow."""
         scale, moved = self.magnification, self.moved
-        if self.at is not None:
+        if self.at is not None or self.place is not None:
             moved = moved + self.distance * self._tangents
         return (grid.y + moved[0]) / scale - centre[0], (grid.x + moved[1]) / scale - centre[1]
 
@@ -106,7 +108,7 @@ class LightPath(Module):
         """(y, x) of the middle of the sensor's samples, mm."""
         if self.at is None or not self.follows:
             return jnp.zeros(2, self.distance.dtype)
-        return -self.distance * self._tangents
+        return -self.distance * self._seen
 
     def chief_ray(self, centre: Float[Array, "2"]) -> "ChiefRay | None":
         """Ray from the point through a mask's `centre` (y, x), mm; None on the axis."""
@@ -135,6 +137,7 @@ class LightPath(Module):
                 object_distance=jnp.where(infinite, jnp.inf, near * n),
                 at=None,
                 sine=sine,
+                place=None,
             )
             for sine, n in stretched
         )
@@ -148,14 +151,21 @@ class LightPath(Module):
             return True
         distance = float(np.asarray(self.object_distance))
         seen = np.asarray(self.at) / (1.0 if math.isinf(distance) else distance)
-        return bool(np.all(np.asarray(centre) / distance != seen))
+        middle = np.asarray(centre) + (0.0 if self.place is None else np.asarray(self.place))
+        return bool(np.all(middle / distance != seen))
+
+    @property
+    def _seen(self) -> Float[Array, "2"]:
+        """Tangents of the point's angles (y, x) from the origin of its frame; 0 on the axis."""
+        if self.at is None:
+            return jnp.zeros(2, self.distance.dtype)
+        infinite = jnp.isinf(self.object_distance)
+        return self.at / jnp.where(infinite, 1.0, self.object_distance)
 
     @property
     def _tangents(self) -> Float[Array, "2"]:
-        """Tangents of the angles (y, x) at which the point is seen from the axis."""
-        assert self.at is not None
-        infinite = jnp.isinf(self.object_distance)
-        return self.at / jnp.where(infinite, 1.0, self.object_distance)
+        """Tangents of the angles (y, x) at which the point is seen from the camera's axis."""
+        return self._seen if self.place is None else self._seen - self.place / self.object_distance
 
 
 class ChiefRay(eqx.Module):
@@ -196,7 +206,8 @@ class LenslessCamera(Module):
 
     - `mask`: any mask; see `thincam_jax.lensless.masks`.
     - `sensor`: shape and pitch of the pixels.
-    - `distance`: mask-sensor distance d, mm, > 0.
+    - `place`: (y, x) of the camera's axis in the scene, mm, by default (0, 0): a part of a `Mosaic`
+      sees near objects from beside the scene's axis, and they move by d/t of it on the sensor.
 
     ```python
     import thincam_jax as tc
@@ -208,7 +219,7 @@ class LenslessCamera(Module):
     print(h.shape)  # (24, 32)
     ```
 
-    **See also**: `FresnelZoneAperture`, `Sensor`, `psf`, `capture`.
+    **See also**: `FresnelZoneAperture`, `Sensor`, `psf`, `capture`, `Mosaic`.
     """
 
     mask: AbstractMask = eqx.field(
@@ -220,6 +231,9 @@ class LenslessCamera(Module):
         converter=functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
     )
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    place: Float[Array, "2"] | None = eqx.field(
+        default=None, converter=quantity("mm", shape=(2,), optional=True), kw_only=True
+    )
 
     def _repr_png_(self) -> bytes:
         """Picture for notebooks: the mask, and the camera from the side."""
@@ -243,14 +257,14 @@ class LenslessCamera(Module):
         if isinstance(object_distance, int | float):
             object_distance = like(object_distance)
         if at is None:
-            return LightPath(wavelength, self.distance, object_distance)
+            return LightPath(wavelength, self.distance, object_distance, place=self.place)
         on_an_axis = self._knows_axis(at)
         if isinstance(at, tuple | list):
             if all(isinstance(n, int | float) for n in at):
                 at = like(at)
             elif any(map(checks.is_traced, at)):
                 at = jnp.stack([jnp.asarray(n, self.distance.dtype) for n in at])
-        path = LightPath(wavelength, self.distance, object_distance, at)
+        path = LightPath(wavelength, self.distance, object_distance, at, place=self.place)
         convert = jnp.asarray if checks.is_traced(path.at) else np.asarray
         path = replace(path, at=convert(path.at, dtype=self.distance.dtype))
         return replace(path, skew=not on_an_axis and path.is_skew(self.mask.centre))
@@ -258,7 +272,7 @@ class LenslessCamera(Module):
     def _knows_axis(self, at: Position) -> bool:
         """Whether one coordinate of a point is known to be 0, and the mask's to be 0, too."""
         centre = self.mask.centre
-        if checks.is_traced(centre) or not isinstance(at, tuple | list):
+        if self.place is not None or checks.is_traced(centre) or not isinstance(at, tuple | list):
             return False
         pairs = zip(at, np.asarray(centre), strict=False)  # other lengths are refused by the path
         return any(isinstance(n, int | float) and n == c == 0 for n, c in pairs)

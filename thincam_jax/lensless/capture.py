@@ -14,6 +14,7 @@ from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
+from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.lensless.plan.run import CapturePlan, run_plan
 from thincam_jax.lensless.resolve import warn_if_unresolved
 
@@ -26,7 +27,7 @@ _ON_AXIS = (
 @checked
 @watched("capturing")
 def capture(
-    camera: LenslessCamera,
+    camera: LenslessCamera | Mosaic,
     scene: Scene,
     *,
     key: Any = None,
@@ -45,6 +46,7 @@ def capture(
 
     **Arguments**
 
+    - `camera`: a camera, or a `Mosaic` of several on one sensor.
     - `scene`: planes with a common batch shape; the batch is captured image by image.
     - `noise`, `key`: see `thincam_jax.imaging.sensor`; without noise the result is deterministic.
     - `model`: PSF model or `PsfMethod`, see `psf`; or what `plan_capture` returns.
@@ -67,15 +69,29 @@ def capture(
 
     **See also**: `Scene`, `plan_capture`, `reconstruct`.
     """
+    if isinstance(camera, Mosaic) and camera.wall is not None:
+        parts = [_light(part, scene, model, pixel_integration) for part in camera.cameras]
+        image = camera.join(parts)
+    else:
+        whole = camera.whole if isinstance(camera, Mosaic) else camera
+        image = _light(whole, scene, model, pixel_integration)
+    return read_out(camera.sensor, image, noise=noise, key=key)
+
+
+def _light(
+    camera: LenslessCamera,
+    scene: Scene,
+    model: Model | PsfMethod | CapturePlan,
+    pixel_integration: bool | None,
+) -> Float[Array, "*batch y x"]:
+    """The noise-free image."""
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
     if isinstance(model, CapturePlan):
         if pixel_integration is not None:
             raise ValueError("a plan chooses pixel_integration: leave it out")
-        image = run_plan(model, camera, scene)
-    else:
-        how = as_method(model, pixel_integration is not False)
-        if camera.sensor.angular_response is not None and how.field_tolerance is None:
-            warnings.warn(_ON_AXIS, AccuracyWarning, stacklevel=3)
-        parts = (expose(camera, plane, scene.spectrum, how) for plane in scene.planes)
-        image = functools.reduce(operator.add, parts)
-    return read_out(camera.sensor, image, noise=noise, key=key)
+        return run_plan(model, camera, scene)
+    how = as_method(model, pixel_integration is not False)
+    if camera.sensor.angular_response is not None and how.field_tolerance is None:
+        warnings.warn(_ON_AXIS, AccuracyWarning, stacklevel=4)
+    planes = (expose(camera, plane, scene.spectrum, how) for plane in scene.planes)
+    return functools.reduce(operator.add, planes)

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import equinox as eqx
 import jax
@@ -18,11 +18,12 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import decimal_value
-from thincam_jax._core.quantity import quantities, unchecked
+from thincam_jax._core.quantity import check_fields, quantities, quantity, unchecked, whole
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import PROFILES, FresnelZoneAperture, Profile
+from thincam_jax.lensless.mosaic import Mosaic
 
 # Mask phases of a turn, rad: all four cancel the background (thesis Eq 3.14), and the pair of
 # method B (Eq 3.49).
@@ -37,6 +38,52 @@ else:
 
 Each = Float[Array, " exposure"] | Float[np.ndarray, " exposure"]
 Given = Numbers | Sequence[float | int]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the masks of exposures that are taken at once lie side by side: a `Mosaic`.
+
+    - `rows`, `columns`: numbers of masks, which follow each other row by row.
+    - `wall`: thickness of walls between them, mm; None for none. `pitch`: distance of their
+      middles, mm; None for the sensor's sides over their number.
+    """
+
+    rows: Annotated[int, whole(1, 16)]
+    columns: Annotated[int, whole(1, 16)]
+    wall: Annotated[float | None, quantity("mm", non_negative=True, optional=True)] = None
+    pitch: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+@dataclass(frozen=True)
+class MosaicPart:
+    """One of several exposures that are taken at once; `exposures` are all of them."""
+
+    number: int
+    exposures: "tuple[Exposure, ...]"
+    layout: Layout
+
+    def camera(self, sensor: Sensor, mask: AbstractMask | None) -> LenslessCamera:
+        """The part as a camera; arguments as of `Exposures.cameras`."""
+        return self.mosaic(sensor, mask).cameras[self.number]
+
+    def mosaic(self, sensor: Sensor, mask: AbstractMask | None) -> Mosaic:
+        """All parts; arguments as of `Exposures.cameras`."""
+        layout, all_ = self.layout, self.exposures
+        masks = [one.mask(mask) for one in all_]
+        nearest = min(one.distance for one in all_)
+        heights = np.reshape([one.distance - nearest for one in all_], (-1, layout.columns))
+        return Mosaic(
+            [masks[n : n + layout.columns] for n in range(0, len(masks), layout.columns)],
+            all_[0].sensor(sensor),
+            nearest,
+            pitch=layout.pitch,
+            wall=layout.wall,
+            spacers=heights if heights.any() else None,
+        )
 
 
 @dataclass(frozen=True)
@@ -55,6 +102,7 @@ class Exposure:
     take: int = 1
     profile: Profile | None = None
     moves: tuple[Plain, Plain] | None = None
+    part: MosaicPart | None = None
 
     def mask(self, mask: AbstractMask | None = None) -> AbstractMask:
         """A zone plate with the numbers of this exposure and all others as of `mask`, whose own
@@ -80,6 +128,8 @@ class Exposure:
 
     def camera(self, sensor: Sensor, mask: AbstractMask | None = None) -> LenslessCamera:
         """The camera that takes it; arguments as of `Exposures.cameras`."""
+        if self.part is not None:
+            return self.part.camera(sensor, mask)
         return LenslessCamera(self.mask(mask), self.sensor(sensor), self.distance)
 
 
@@ -96,6 +146,7 @@ class Exposures(Module):
     - `take`: number of the exposure among those with the same settings, each with noise of its own;
       by default they are counted.
     - `moves`: x of the object's middle at the beginning and the end of each, mm; see `ImagePlane`.
+    - `layout`: masks side by side, which take all at once; None for one after another.
 
     Plain numbers are kept with all their digits, arrays of JAX as they are: gradients pass through
     them to the cameras.
@@ -123,6 +174,7 @@ class Exposures(Module):
     moves: Float[Array, "exposure 2"] | Float[np.ndarray, "exposure 2"] | None
     take: tuple[int, ...] = eqx.field(static=True)
     profile: tuple[Profile | None, ...] = eqx.field(static=True)
+    layout: Layout | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -136,6 +188,7 @@ class Exposures(Module):
         profile: Profile | None | Sequence[Profile | None] = None,
         take: Sequence[int] | None = None,
         moves: Numbers | Sequence[Sequence[float]] | None = None,
+        layout: Layout | None = None,
     ):
         given = {"beta": beta, "phase": phase, "distance": distance, "wavelength": wavelength}
         given |= {"width": width, "relative_time": relative_time}
@@ -156,6 +209,9 @@ class Exposures(Module):
             setattr(self, name, spread.broadcast_to(value, (count,)))
         self.profile = tuple(profiles * count if len(profiles) == 1 else profiles)  # pyright: ignore
         self.moves = None if moves is None else _moves(moves, count)
+        self.layout = layout
+        if layout is not None:
+            _check_layout(layout, count, numbers["relative_time"])
         self.take = (1,) * count
         self.take = _counted(self) if take is None else tuple(take)
 
@@ -170,6 +226,13 @@ class Exposures(Module):
         return self._row(number, lambda one: decimal_value(one))
 
     def _row(self, number: int, read: Any) -> Exposure:
+        one = self._alone(number, read)
+        if self.layout is None:
+            return one
+        every = tuple(self._alone(n, read) for n in range(len(self)))
+        return dataclasses.replace(one, part=MosaicPart(number, every, self.layout))
+
+    def _alone(self, number: int, read: Any) -> Exposure:
         ends = None if self.moves is None else self.moves[number]
         return Exposure(
             read(self.beta[number]),
@@ -220,16 +283,35 @@ class Exposures(Module):
         """Each exposure at the phases 0 and 3π/2 (thesis Eq 3.49)."""
         return self.at_phases(PAIR)
 
+    def at_once(self, layout: Layout) -> "Exposures":
+        """These exposures in one, by masks side by side."""
+        return dataclasses.replace(self, layout=layout)
+
     def of_moving(self, speed: float) -> "Exposures":
         """These exposures of an object that moves, one after another without a pause.
+
+        Those with a layout are taken at once.
 
         `speed`: mm to +x during an exposure of the sensor's own time. Half way through all
         exposures the object is on the axis.
         """
         ends = np.cumsum([0.0, *(one.relative_time for one in self)])
+        if self.layout is not None:
+            half = speed * self[0].relative_time / 2
+            return dataclasses.replace(self, moves=[[-half, half]] * len(self))
         ends = speed * (ends - ends[-1] / 2)
         moves = np.asarray(list(itertools.pairwise(ends.tolist())))
         return dataclasses.replace(self, moves=moves)
+
+
+def _check_layout(layout: Layout, count: int, times: Any) -> None:
+    """Refuse exposures that are no mosaic."""
+    if count != layout.rows * layout.columns:
+        raise ValueError(
+            f"{count} exposures do not fill {layout.rows}×{layout.columns} masks; give as many"
+        )
+    if np.ptp(np.asarray(times)) > 0:
+        raise ValueError("masks side by side are exposed together: give one relative_time")
 
 
 def _as_stored(one: Any) -> Any:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -180,7 +181,8 @@ def field_fit(
     assert method.field_tolerance is not None
     tolerance, tangents = method.field_tolerance, tangents_of(camera, field_shape)
     sensor, grid = camera.sensor, kernel_grid(camera.sensor.grid, field_shape)
-    fall = light_over_field(sensor, *tangents)
+    aside = _aside(camera, object_distance)
+    fall = light_over_field(sensor, *(t + n for t, n in zip(tangents, aside, strict=True)))
     if tolerance >= 1:
         own = spectral_psf(camera, colours, object_distance, method, grid)
         axis = CropConvolution(own[None], sensor.pitch, sensor.shape, field_shape, summed=1)
@@ -200,7 +202,7 @@ def field_fit(
 
     def psf_at(y: float, x: float) -> Float[Array, "k l"]:
         # The object is turned by 180° on the sensor.
-        at = (-scale * y, -scale * x) if y or x else None
+        at = (-scale * y, -scale * x) if y or x or camera.place is not None else None
         return spectral_psf(camera, colours, object_distance, method, grid, at)
 
     between = max(between) + _averages(camera, colours, object_distance, grid, method)
@@ -212,6 +214,11 @@ def field_fit(
     convolution = CropConvolution(kernels, sensor.pitch, sensor.shape, field_shape, summed=1)
     found = LowRank(jnp.asarray(weights, kernels.dtype), convolution)
     return LowRankFit(found, error, between)
+
+
+def _aside(camera: LenslessCamera, object_distance: Number) -> Any:
+    """Tangents (y, x) by which a camera beside the scene's axis sees it turned."""
+    return (0.0, 0.0) if camera.place is None else np.asarray(camera.place / object_distance)
 
 
 def _averages(
@@ -297,7 +304,8 @@ def _on_grid(
     psf_at: Callable[[float, float], Float[Array, "k l"]],
 ) -> Float[Array, "y x k l"]:
     """PSFs at every pair of places; a zone plate on the axis is its own mirror image."""
-    mirrored = zone_orders(camera.mask) is not None and not np.asarray(camera.mask.centre).any()
+    on_axis = camera.place is None and not np.asarray(camera.mask.centre).any()
+    mirrored = zone_orders(camera.mask) is not None and on_axis
     found: dict[tuple[float, float], Float[Array, "k l"]] = {}
 
     def at(y: float, x: float) -> Float[Array, "k l"]:

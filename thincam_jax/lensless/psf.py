@@ -31,7 +31,7 @@ from thincam_jax._core.progress import watched
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
-from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
 from thincam_jax.lensless.propagation.geometric import geometric
@@ -303,6 +303,8 @@ def _computed(
     pixel_integration: bool = True,
 ):
     """`function` of what `resolve` gives, in the camera's precision."""
+    if path.at is None and path.place is not None and as_method(model).model in SAMPLED:
+        path = replace(path, at=jnp.zeros_like(path.place))  # these follow the ray
     mask, grid, path, method = resolve(camera, path, model, pixel_integration)
     own = precision_of(camera.sensor.pitch)
     with allow(method.precision or own, mask, grid, path), watched("computing the PSF"):

@@ -149,7 +149,9 @@ def require_off_axis(mask: AbstractMask, path: LightPath, model: Model) -> None:
 
     Known numbers only: of traced ones, the model alone is looked at.
     """
-    if path.at is None or model in (*SAMPLED, "geometric"):
+    if (path.at is None and path.place is None) or model in (*SAMPLED, "geometric"):
+        return
+    if path.at is None and model in ("separable", "radial"):  # the waves of the axis, moved
         return
     if model != "separable":
         raise ValueError(

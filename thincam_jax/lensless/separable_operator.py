@@ -73,7 +73,7 @@ def separable_operator(
     print(found.operator.terms)  # 1
     ```
 
-    **See also**: `measured.calibration.calibrate_separable`, `fit_separable`.
+    **See also**: `measured.calibration.calibrate_separable`, `measured.calibration.fit_separable`.
     """
     if len(scene.planes) != 1:
         raise ValueError(

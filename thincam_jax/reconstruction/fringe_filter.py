@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
@@ -41,9 +42,10 @@ class FringeFilter(eqx.Module):
 
     **Arguments**: `cameras`, of one sensor, distance and β, with the phases 0, π/2, π, 3π/2, or 0
     and one of π/2 and 3π/2, in any order, that of the captures. Their wavelength is not used.
+    The parts of a `Mosaic`, whose shadows lie elsewhere on each, are brought together first.
     """
 
-    inverse: Complex[Array, "v u"]
+    inverse: Complex[Array, "#capture v u"]
     weights: Complex[Array, " capture"]
     light: Float[Array, "m n"]
     object_pitch: Float[Array, ""]
@@ -52,7 +54,8 @@ class FringeFilter(eqx.Module):
 
     def __init__(self, cameras: Cameras):
         cameras.require("object_distance")
-        (beta, weights), camera = _check_phases(cameras.cameras), cameras.cameras[0]
+        (beta, weights), found = _check_phases(cameras.cameras), cameras.cameras
+        camera = found[0]
         sensor = camera.sensor.grid
         self.sensor_shape = sensor.shape
         self.field_shape = same_parity(cameras.pixels or sensor.shape, sensor.shape)
@@ -61,7 +64,10 @@ class FringeFilter(eqx.Module):
         padded = fast_shape((rows, columns))
         object_distance = checks.positive("object_distance", cameras.object_distance, "mm")
         grid, ratio = Grid(padded, sensor.pitch), (camera.distance, object_distance)
-        self.inverse = _inverse_filter(grid, beta, ratio, camera.mask.centre)
+        shadows = jnp.stack([_shadow(c, object_distance) for c in found])
+        if bool(jnp.all(shadows == shadows[0])):
+            shadows = shadows[:1]  # one filter for all
+        self.inverse = _inverse_filter(grid, beta, ratio, shadows)
         self.weights = checks.as_array(weights.astype(self.inverse.dtype))
         self.light = cameras.light(self.field_shape).astype(sensor.pitch.dtype)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
@@ -77,13 +83,16 @@ class FringeFilter(eqx.Module):
 
     @eqx.filter_jit
     def _image(self, captures: Float[Array, "capture y x"]) -> Float[Array, "m n"]:
-        if len(self.weights) == 2:  # four cancel the whole background, two only its mean
+        # Four phases cancel the whole background if all have it in one place, others its mean.
+        if len(self.weights) == 2 or len(self.inverse) > 1:
             captures = captures - jnp.mean(captures, axis=(1, 2), keepdims=True)
-        scanned = jnp.tensordot(self.weights, as_complex(captures), axes=1, precision="highest")
-        padded = self.inverse.shape
-        margins = [(0, p - s) for p, s in zip(padded, scanned.shape, strict=True)]
-        spectrum = jnp.fft.fft2(jnp.pad(scanned, margins)) * self.inverse
-        full = jnp.fft.ifft2(spectrum).real
+        scanned = self.weights[:, None, None] * as_complex(captures)
+        if len(self.inverse) == 1:
+            scanned = jnp.sum(scanned, axis=0, keepdims=True)
+        padded = self.inverse.shape[1:]
+        margins = [(0, p - s) for p, s in zip(padded, self.sensor_shape, strict=True)]
+        spectrum = jnp.fft.fft2(jnp.pad(scanned, [(0, 0), *margins])) * self.inverse
+        full = jnp.fft.ifft2(jnp.sum(spectrum, axis=0)).real
         # Sample j of the field is sample j + (sensor − field)/2 of the sensor.
         shift = [(f - s) // 2 for f, s in zip(self.field_shape, self.sensor_shape, strict=True)]
         field = jnp.roll(full, shift, axis=(0, 1))[: self.field_shape[0], : self.field_shape[1]]
@@ -120,9 +129,16 @@ class FringeScanning(AbstractSolver):
         return self.prepare(require_cameras(recording, self.name))(jnp.stack(recording.light))
 
 
+def _shadow(camera: LenslessCamera, object_distance: Number) -> Float[Array, "2"]:
+    """Middle (y, x) of the shadow of a point of the scene's axis on the camera's sensor, mm."""
+    reach = camera.distance / object_distance
+    aside = 0.0 if camera.place is None else reach * camera.place
+    return (1 + reach) * camera.mask.centre + aside
+
+
 @jax.jit
-def _inverse_filter(grid: Grid, beta, distances, centre) -> Complex[Array, "v u"]:
-    """(β'/π)·exp(−jπ²ρ²/β') where the window samples it, zero elsewhere."""
+def _inverse_filter(grid: Grid, beta, distances, shadows) -> Complex[Array, "n v u"]:
+    """(β'/π)·exp(−jπ²ρ²/β') where the window samples it, else zero; for each shadow's middle."""
     distance, object_distance = distances
     magnification = 1 + distance / object_distance
     beta = beta / magnification**2
@@ -132,8 +148,7 @@ def _inverse_filter(grid: Grid, beta, distances, centre) -> Complex[Array, "v u"
     )
     gain = jnp.where(sampled, beta / jnp.pi, 0.0)
     filtered = phasor(-(jnp.pi**2) * (u**2 + v**2) / beta)
-    # A mask beside the axis shifts the shadow by M times its centre.
-    down, right = magnification * centre
+    down, right = shadows.T[:, :, None, None]
     return gain.astype(filtered.dtype) * filtered * turn_phasor(v * down + u * right)
 
 
@@ -169,5 +184,5 @@ def _check_phases(
 
 
 def _fixed_numbers(mask: FresnelZoneAperture) -> tuple:
-    numbers = mask.beta, *mask.extent, mask.fill_factor, *mask.centre
+    numbers = mask.beta, *mask.extent, mask.fill_factor
     return *(float(n) for n in numbers), mask.profile, mask.harmonics, mask.pixels

@@ -149,6 +149,8 @@ class Cameras(Module):
             pitch, distance = float(camera.sensor.pitch), float(camera.distance)
             spread = 1 + pitch / self._projected(distance)
             mask = np.asarray(camera.mask.extent) + 2 * np.abs(np.asarray(camera.mask.centre))
+            if camera.place is not None:
+                mask = mask + 2 * (1 - 1 / spread) * np.abs(np.asarray(camera.place))
             sizes.append(ratio * (np.array(camera.sensor.shape) + spread * mask / pitch))
         rows, columns = np.ceil(np.max(sizes, axis=0)).astype(int)
         return int(rows), int(columns)

@@ -16,6 +16,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.forward import in_steps, projected_shape
 from thincam_jax.lensless.method import Model, PsfMethod
+from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.recording import Recording
 
@@ -23,7 +24,7 @@ from thincam_jax.reconstruction.recording import Recording
 @checked
 @watched("recording")
 def record(
-    camera: LenslessCamera | Sequence[LenslessCamera],
+    camera: LenslessCamera | Mosaic | Sequence[LenslessCamera],
     scene: Scene,
     *,
     noise: AbstractNoise | float | int | None = None,
@@ -37,7 +38,8 @@ def record(
 
     **Arguments**
 
-    - `camera`: one, or one for each capture: phases, pitches, distances.
+    - `camera`: one, or one for each capture: phases, pitches, distances; or a `Mosaic`, whose one
+      frame is split.
     - `noise`: its signal-to-noise ratio in dB (`GaussianNoise`), or a noise; None for none.
     - `key`: seed of the noise, or a key; each capture has a noise of its own.
     - `model`: PSF model of captures and reconstruction, see `psf`.
@@ -56,7 +58,11 @@ def record(
 
     **See also**: `capture`, `Recording`, `Scene.photograph`.
     """
-    cameras = [camera] if isinstance(camera, LenslessCamera) else list(camera)
+    mosaic = camera if isinstance(camera, Mosaic) else None
+    if isinstance(camera, Mosaic):
+        cameras = list(camera.cameras)
+    else:
+        cameras = [camera] if isinstance(camera, LenslessCamera) else list(camera)
     noise = GaussianNoise(noise) if isinstance(noise, float | int) else noise
     distances = [plane.distance for plane in scene.planes]
     light = scene.spectrum
@@ -66,17 +72,20 @@ def record(
         object_distance=distances[0] if len(distances) == 1 else np.unique(distances),
         model=model,
     )
-    key = random_key(key)
-    keys = [key] if len(cameras) == 1 else jax.random.split(key, len(cameras))
-    captures = [
+    key, exposed = random_key(key), cameras if mosaic is None else [mosaic]
+    keys = [key] if len(exposed) == 1 else jax.random.split(key, len(exposed))
+    frames = [
         capture(one, scene, noise=noise, key=k, model=model)
-        for one, k in zip(cameras, keys, strict=True)
+        for one, k in zip(exposed, keys, strict=True)
     ]
     variances = None
-    if isinstance(noise, GaussianNoise) and not checks.holds_traced(captures):
-        variances = [float(np.mean(np.asarray(noise.variance(one)))) for one in captures]
+    if isinstance(noise, GaussianNoise) and not checks.holds_traced(frames):
+        variances = [float(np.mean(np.asarray(noise.variance(one)))) for one in frames]
+    if mosaic is not None:
+        frames = mosaic.split(frames[0])
+        variances = variances and variances * len(frames)
     if not checks.holds_traced(scene, cameras):
         covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]
         widest = np.minimum(in_steps(np.max(covers, axis=0).tolist()), optics.seen_field)
         optics = optics.replace(field_shape=tuple(int(n) for n in widest), whole_scene=True)
-    return Recording(captures, optics, noise_variance=variances)
+    return Recording(frames, optics, noise_variance=variances)

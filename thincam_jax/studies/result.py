@@ -102,7 +102,9 @@ def _profile(study: Study, exposure: Exposure) -> np.ndarray:
     """The OTF of one exposure along u ≥ 0, v = 0."""
     light = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
     how = {"model": study.model, "pixel_integration": study.pixel_integration}
-    response = np.asarray(otf(study.camera(exposure), **light, **how))
+    # A part of a mosaic, as if it were alone.
+    camera = study.camera(exposure).replace(place=None).on_grid(study.sensor.grid)
+    response = np.asarray(otf(camera, **light, **how))
     rows, columns = study.sensor.shape
     return response[rows // 2, columns // 2 :]
 

@@ -103,6 +103,12 @@ class Method:
             raise ValueError(
                 f"kind fringe_scanning takes one shot, at the phases of {' or '.join(_PHASES)}"
             )
+        layout = self.exposures.layout
+        if isinstance(self.solver, FringeScanning) and layout is not None and layout.wall is None:
+            raise ValueError(
+                "kind fringe_scanning knows the shadow of one mask alone; give the mosaic a wall, "
+                "or use kind wiener"
+            )
         self._check_harmonics()
         self._check_shots()
 

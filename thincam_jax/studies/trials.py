@@ -85,7 +85,8 @@ def simulate_trials(
     for number, method in enumerate(study.methods):
         for exposure in method.exposures:
             if exposure not in clean:
-                clean[exposure] = noise_free(study, exposure, target.plane)
+                plane = replace(target.plane, moves=exposure.moves)
+                clean[exposure] = noise_free(study, exposure, plane)
         shape = field_shape(study, method, target)
         solve = reconstructor(study, method, shape, target.distance)
         trials[method.name] = []

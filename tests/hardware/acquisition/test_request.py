@@ -43,7 +43,11 @@ def test_steps(request_, kinds, positions):
     ("given", "field", "message"),
     [
         ({"kind": "method_b", **ZONES}, "betas", "compares two β or more"),
-        ({"kind": "fringe_scan", **ZONES, "frames": 2}, "frames", "takes betas, width, profile;"),
+        (
+            {"kind": "fringe_scan", **ZONES, "frames": 2},
+            "frames",
+            "takes betas, width, profile, mosaic;",
+        ),
         ({"kind": "method_a", **ZONES}, "distances", "a plan of kind method_a needs it"),
         ({"kind": "pictures"}, "cells", "needs it"),
         ({"kind": "method_a", **ZONES, "distances": (5.0, 5.0)}, "distances", "stands twice"),

@@ -29,6 +29,7 @@ class Pattern:
     """Pattern on a display: a kind and the numbers that define it.
 
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
+    - "mosaic": `rows` × `columns` of these, `pitch` mm apart, each with its "beta N", "phase N".
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
     - "picture": `name` and SHA-256 `digest` of its levels on `rows` × `columns` cells.
     - "pixels": the same of levels of so many pixels, such as a phase mask's.

@@ -10,6 +10,7 @@ from thincam_jax._core.quantity import FieldError, check_fields, choice, quantit
 from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.plan import WHITE, AcquisitionPlan, Pattern
 from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.lensless.exposures import Layout
 from thincam_jax.lensless.masks.fza import PROFILES, Profile
 from thincam_jax.measured.calibration.alignment import MapKind
 from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, HadamardSeries, Order
@@ -31,9 +32,9 @@ ANYTHING = "scene", "grey_levels"  # plans before which anything may stand
 # What each kind needs, and what it may have beside the dark frames.
 _ZONES = ("betas", "width")
 _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "fringe_scan": (_ZONES, ("profile",)),
+    "fringe_scan": (_ZONES, ("profile", "mosaic")),
     "method_a": ((*_ZONES, "distances"), ("profile",)),
-    "method_b": (_ZONES, ("profile",)),
+    "method_b": (_ZONES, ("profile", "mosaic")),
     "psf_stack": (("distances",), (*_ZONES, "profile", "phase")),
     "hadamard": (("cells",), ("order", "display")),
     "pictures": (("cells",), (*_ZONES, "profile", "phase", "frames")),
@@ -61,6 +62,7 @@ class PlanRequest:
       tilted.
     - `frames`: frames of each picture, mark or level, whose mean counts; of each exposure of a
       scene.
+    - `mosaic`: masks side by side, all in one exposure; their `pitch` is whole display pixels.
     - `exposures`: exposures of a scene, in place of the camera's; several are merged to one linear
       image.
     - `dark_frames`: in all; they are spread over the plan. Of a scene, for each exposure.
@@ -84,6 +86,7 @@ class PlanRequest:
     frames: Annotated[int, whole(1, 1000)] = 1
     exposures: Annotated[tuple[float, ...], quantity("s", positive=True, many=True)] = ()
     dark_frames: Annotated[int, DARK_FRAMES] = 0
+    mosaic: Layout | None = None
 
     def __post_init__(self):
         check_fields(self)
@@ -100,6 +103,11 @@ class PlanRequest:
             raise FieldError("method_b compares two β or more; give another", "betas")
         if self.kind != "method_b" and len(self.betas) > 1:
             raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
+        if self.mosaic is not None:
+            masks = 4 if self.kind == "fringe_scan" else 2 * len(self.betas)
+            if masks != self.mosaic.rows * self.mosaic.columns or self.mosaic.pitch is None:
+                fault = f"{masks} masks are shown; give as many rows × columns, and their pitch"
+                raise FieldError(fault, "mosaic")
         for key in ("frames", "dark_frames"):
             if len(self.exposures) > 1 and getattr(self, key) < 2:
                 raise FieldError("exposures are weighed by the noise of each; give 2 or more", key)
@@ -148,6 +156,10 @@ class PlanRequest:
         coloured = camera.bayer is not None
         grey = f"{kind}{' with a matrix' if matrix else ''} takes one colour; give a Mono format"
         yield coloured and (matrix or name in MONITOR), grey, "camera", "pixel_format"
+        whole = self.mosaic is not None and camera.region is not None
+        yield whole, "a mosaic has parts on the whole sensor; drop it", "camera", "region"
+        striped = self.mosaic is not None and coloured
+        yield striped, "a mosaic takes one colour; give a Mono format", "camera", "pixel_format"
         light = "a wavelength and no colours"
         light = "colours: [red, green, blue] and no wavelength" if coloured else light
         for key, wanted in (("colours", coloured), ("wavelength", not coloured)):
@@ -199,9 +211,15 @@ class PlanRequest:
         if self.kind == "scene":
             given = {"exposures": self.exposures, "frames": self.frames, **dark}
             return plans.scene(mask, settings, **given)
-        if self.kind == "method_b":
-            return plans.method_b(mask, self.betas, settings, **dark)
-        if self.kind == "fringe_scan":
-            return plans.fringe_scan(mask, settings, **dark)
+        if self.kind in ("method_b", "fringe_scan"):
+            if self.kind == "method_b":
+                plan = plans.method_b(mask, self.betas, settings, **dark)
+            else:
+                plan = plans.fringe_scan(mask, settings, **dark)
+            if self.mosaic is None:
+                return plan
+            masks = [plan.pattern(step) for step in plan.steps if not step.dark]
+            rows, columns, pitch = self.mosaic.rows, self.mosaic.columns, self.mosaic.pitch or 0.0
+            return plans.mosaic(masks, rows, columns, pitch, settings, **dark)
         of_distances = plans.method_a if self.kind == "method_a" else plans.psf_stack
         return of_distances(mask, self.distances, settings, stage_zero=stage_zero, **dark)

@@ -225,8 +225,14 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     """The state and the optics that the virtual devices of a file share."""
     from thincam_jax.hardware.base import CameraSettings
     from thincam_jax.hardware.commands.run import build_study, picture_levels, screen_system
+    from thincam_jax.hardware.studies.images import mosaic_of
     from thincam_jax.hardware.studies.rig import lensless_system, scenes_of
-    from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, MosaicOptics
+    from thincam_jax.hardware.virtual.optics import (
+        ModulatorOptics,
+        MonitorOptics,
+        MosaicOptics,
+        WalledOptics,
+    )
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 
     virtual, display, optics = config.virtual, config.display, config.optics
@@ -247,6 +253,9 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
             table = virtual.phase_levels or display.phase_levels
             light += table.build(), pixels.amplitude.shape
         parts = [ModulatorOptics(one, study.sensor, *light) for one in scenes_of(study)]
+        side_by_side = mosaic_of(study)
+        if side_by_side is not None and side_by_side.wall is not None:
+            parts = [WalledOptics(one, side_by_side) for one in parts]
         pattern = config.camera.build(CameraSettings, region=None).bayer
         seen = parts[0] if pattern is None else MosaicOptics(parts, pattern)
     given = {"electronics": virtual.build(Electronics), "display_shape": virtual.display}

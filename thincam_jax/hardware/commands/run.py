@@ -236,6 +236,8 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     for number, light in enumerate(optics.colours or (optics.wavelength,)):
         shots = Exposures(betas, distances, wavelength=light or 0.0, width=width)
         exposures = shots.at_phases(phases)
+        if plan.mosaic is not None:
+            exposures = exposures.at_once(plan.mosaic.build())
         methods.append(Method(f"{number}", exposures, solver, synthesis, len(phases)))
 
     def target(entry: PictureConfig) -> Target:

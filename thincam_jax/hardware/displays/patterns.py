@@ -44,6 +44,8 @@ def pattern_levels(
         return on_cells(255 * HadamardSeries(cells, **numbers).frame(frame), shape)
     if pattern.kind == "mark":
         return _mark(shape, pitch, **numbers)
+    if pattern.kind == "mosaic":
+        return _mosaic(shape, pitch, numbers)
     if pattern.kind != "fza":
         raise ValueError(f"a pattern of kind {pattern.kind!r} has no levels; give an own `render`")
     return mask_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
@@ -56,6 +58,34 @@ def _mark(shape: tuple[int, int], pitch: float, x: float, y: float, size: float)
     if any(not radius <= at + 0.5 <= n - radius for n, at in zip(shape, centre, strict=True)):
         raise ValueError(f"a mark of {size:g} mm at {x:g}, {y:g} mm is not all on the display")
     levels[skimage.draw.disk(centre, radius)] = 255
+    return levels
+
+
+def _mosaic(shape: tuple[int, int], pixel: float, numbers: dict[str, Any]) -> np.ndarray:
+    """Levels of zone plates side by side, each on whole pixels of the display."""
+    levels = np.zeros(shape, np.uint8)
+    cells, side = (numbers["rows"], numbers["columns"]), round(numbers["width"] / pixel)
+    for number in range(cells[0] * cells[1]):
+        middles = np.array(np.unravel_index(number, cells)) - (np.array(cells) - 1) / 2
+        corner = np.array(shape) / 2 + middles * numbers["pitch"] / pixel - side / 2
+        top, left = (round(float(n)) for n in corner)
+        if np.abs(corner - (top, left)).max() > 1e-3 or min(top, left) < 0:
+            raise ValueError(
+                f"masks of {numbers['width']:g} mm, {numbers['pitch']:g} mm apart, are not on "
+                f"whole pixels of a display of {shape}; give a width and a mosaic.pitch that "
+                f"are an even number of {pixel:g} mm, and fit"
+            )
+        mask = FresnelZoneAperture(
+            numbers[f"beta {number}"],
+            numbers[f"phase {number}"],
+            width=numbers["width"],
+            profile=numbers["profile"],
+            pixel_pitch=pixel,
+        )
+        if top + side > shape[0] or left + side > shape[1]:
+            raise ValueError(f"the masks are larger than the display of {shape} pixels")
+        shown = mask_pattern(mask, (side, side), pixel)
+        levels[top : top + side, left : left + side] = shown
     return levels
 
 

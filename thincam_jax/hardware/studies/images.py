@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.measured.bayer import Pattern, colour_sites, demosaic, demosaic_mask
 from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
@@ -44,13 +45,23 @@ def frame_solver(
     pairs = zip(study.methods, shares, strict=True)
     solvers = [_solver_of(study, method, width, share) for method, share in pairs]
 
-    def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
+    mosaic = mosaic_of(study)
+
+    def solved(frames: Float[np.ndarray, "frame v u"]) -> Reconstruction:
+        if mosaic is not None:
+            frames = np.stack(mosaic.split(np.asarray(frames[0])))
         pairs = zip(solvers, _channels(frames, variance, bayer), strict=True)
         found = [solve(*channel) for solve, channel in pairs]
         last = max(found, key=lambda one: one.iterations)
         return replace(last, image=jnp.concatenate([one.image for one in found]))
 
     return solved
+
+
+def mosaic_of(study: Study) -> Mosaic | None:
+    """The masks side by side whose captures are parts of one frame, of a study that has them."""
+    one = study.methods[0].exposures[0]
+    return None if one.part is None else one.part.mosaic(study.sensor, study.mask)
 
 
 def _channels(
@@ -118,6 +129,9 @@ def live_image(
     """
     methods = []
     for number, method in enumerate(study.methods):
+        if method.exposures.layout is not None:  # all in a frame
+            methods.append(replace(method, name=f"live {number}", solver=Wiener()))
+            continue
         one = method.exposures[0]
         light = {"wavelength": one.wavelength, "width": one.width, "profile": one.profile}
         first = Exposures(one.beta, one.distance, phase=one.phase, **light)

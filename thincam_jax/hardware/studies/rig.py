@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from thincam_jax._core.grids import Grid, same_parity
-from thincam_jax.hardware.studies.images import FrameSolver, square_field
+from thincam_jax.hardware.studies.images import FrameSolver, mosaic_of, square_field
 from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import CropConvolution, ReducedMatrix, Sparse
@@ -134,9 +134,14 @@ def compare_frames(
         np.stack([noise_free(study, exposure, *scene.planes) for exposure in method.exposures])
         for method, scene in zip(study.methods, scenes_of(study), strict=True)
     ]
+    side_by_side, lit = mosaic_of(study), rig.lit
+    if side_by_side is not None:
+        parts = [np.ones(side_by_side.part_shape)] * len(light[0])
+        lit = lit & (np.asarray(side_by_side.join(parts)) > 0)
+        light = [np.asarray(side_by_side.join([*one]))[None] for one in light]
     part = np.stack(light, axis=1)[..., *rig.pixels]  # capture, colour, y, x
     clean = camera.counts * (part[:, 0] if rig.bayer is None else mosaic(part, rig.bayer))
-    variance, dark, lit = camera.variance(clean), np.zeros(clean.shape[1:]), rig.lit
+    variance, dark = camera.variance(clean), np.zeros(clean.shape[1:])
     if rig.variance is not None:
         known = np.isfinite(rig.variance)
         variance = np.where(known, rig.variance, np.median(rig.variance))[None]

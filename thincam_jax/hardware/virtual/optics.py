@@ -26,6 +26,7 @@ from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.sampled import SampledMask
+from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
 from thincam_jax.measured.bayer import Pattern, mosaic
@@ -111,6 +112,41 @@ class ModulatorOptics:
             convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)
             image = image + np.asarray(convolution(project(camera, plane, shape)))
         return (self.electrons * image).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class WalledOptics:
+    """Masks side by side on one display, with walls from between them to the sensor.
+
+    - `optics`: display and scene without the walls, a `ModulatorOptics`.
+    - `mosaic`: the parts; of its masks only the places count.
+    """
+
+    optics: ModulatorOptics
+    mosaic: Mosaic
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        return self.optics.sensor_shape
+
+    def __call__(
+        self, shown: UInt8[np.ndarray, "v u"], position: float
+    ) -> Float[np.ndarray, "y x"]:
+        parts = []
+        for number, mask in enumerate(self.mosaic.placed):
+            alone = np.zeros_like(shown)
+            reach = zip(shown.shape, np.asarray(mask.centre), mask.extent, strict=True)
+            rows, columns = (_pixels(*one, self.optics.pixel_pitch) for one in reach)
+            alone[rows, columns] = shown[rows, columns]
+            parts.append(self.mosaic.split(self.optics(alone, position))[number])
+        return np.asarray(self.mosaic.join(parts))
+
+
+def _pixels(count: int, middle: Any, side: Any, pitch: float) -> slice:
+    """Pixels of a display that lie in a part of its width, mm."""
+    ends = ((float(middle) + sign * float(side) / 2) / pitch for sign in (-1, 1))
+    first, last = (round(count / 2 + end) for end in ends)
+    return slice(max(first, 0), last)
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,7 +159,8 @@ def fit_separable(
     rng = np.random.default_rng(0)
     truth = Separable(rng.normal(size=(6, 3)), rng.normal(size=(5, 4)))
     images = jnp.asarray(rng.random((8, 3, 4)))
-    fit = tc.fit_separable(images, truth(images), Separable(1.1 * truth.left, truth.right))
+    start = Separable(1.1 * truth.left, truth.right)
+    fit = tc.measured.calibration.fit_separable(images, truth(images), start)
     ```
 
     **See also**: `measured.calibration.calibrate_separable`.
