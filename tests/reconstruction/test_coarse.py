@@ -98,7 +98,7 @@ def test_some_30_iterations_after_coarse_ones_do_what_1000_do(dark):
     assert min(p.objective for p in result.history) < 1.02 * lowest
     assert relative_l2(result.image, minimiser.image) < 0.015
     scores = [psnr(np.asarray(one.image), picture) for one in (result, minimiser)]
-    assert scores[0] > scores[1] - 0.03
+    assert scores[0] > scores[1] - 0.1  # dB
     # From an image that is given all pixels take their iterations, black as before.
     cold = jnp.full(result.image.shape, 0.0 if dark else 0.5)
     short = dataclasses.replace(default, iterations=30)

@@ -60,8 +60,8 @@ _BALANCED = 30
 # How often pixels are made twice as large, and the tolerance there: the image is only a start.
 # From it an image ends that changes by less than this times the tolerance in ten iterations.
 _COARSER, _ROUGH, _STILL = 2, 3e-3, 100.0
-# Iterations after which penalties that suit an image have lowered the objective, or are balanced.
-_TRIED = 20
+# Iterations after which penalties that suit an image lead away if the objective rises by this.
+_TRIED, _RISEN = 20, 1e-3
 # Variation of an image whose smooth light counts less, in parts of the first one's, below which it
 # is taken: 0.35 to 0.85 where shading had spoilt detail. That of a real hand is 1.0, with haze.
 _CALMER = 0.92
@@ -362,18 +362,22 @@ class AdmmTV(AbstractRegularised):
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)
         # Penalties are those of the image, and stay: unless they lead away, as from smooth misfit.
-        begin, rose = float(np.sum(np.asarray(compiled_objective(problem, image)))), []
+        lowest, rose = float(np.sum(np.asarray(compiled_objective(problem, image)))), []
 
         def watch(progress):
-            if progress.iteration == _TRIED and progress.objective > begin:
+            nonlocal lowest
+            is_stopped = callback is not None and callback(progress)
+            is_higher = progress.objective > (1 + _RISEN) * lowest
+            if is_higher and progress.iteration >= _TRIED and not is_stopped:
                 rose.append(progress)
-            return (callback is not None and callback(progress)) or rose
+            lowest = min(lowest, progress.objective)
+            return is_stopped or rose
 
         schedule = Schedule(self.iterations, self.tolerance, still=_STILL * self.tolerance)
         method = in_parallel(problem, admm_method, image)
         second = iterate(method, image, schedule, callback=watch)
-        if rose and second.status == "stopped" and self.iterations > _TRIED:
-            third = self._by_admm(problem, second.image, callback, _TRIED)
+        if rose and second.iterations < self.iterations:
+            third = self._by_admm(problem, second.image, callback, second.iterations)
             second = _joined(second, third)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
 
