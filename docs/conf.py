@@ -143,6 +143,7 @@ MODULES = (
     "studies.prepared",
     "waveguide.colours",
     "waveguide.distance",
+    "waveguide.field_of_view",
     "waveguide.rays",
     "waveguide.screen_to_sensor",
     "waveguide.smear",

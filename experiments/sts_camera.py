@@ -12,6 +12,7 @@ on the plate the holograms are: these are assumptions.
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -25,6 +26,7 @@ from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
 from thincam_jax.waveguide.colours import colour_system
+from thincam_jax.waveguide.field_of_view import field_of_view
 from thincam_jax.waveguide.rays import pixel_centres
 from thincam_jax.waveguide.smear import trace_band
 
@@ -86,6 +88,31 @@ ax.set(xlabel="z from the sensor (mm)", ylabel="y (mm), down the screen", xlim=(
 ax.invert_yaxis()
 ax.legend(loc="lower left", fontsize="small")
 figure.savefig(FIGURES / "rays.png", dpi=110)
+
+# %%
+# Field of view
+# -------------
+#
+# The thesis says 34.3° and neither how it counts nor d1. By the whole sensor (1024 × 1280 pixels,
+# not the crop) the holograms end the vertical field; where they do depends on d1.
+
+distances = np.linspace(5, 35, {"full": 61, "small": 13}[SIZE])
+whole = [
+    replace(camera, sensor=tc.Sensor((1024, 1280), 4.8 * um), lens_distance=d1) for d1 in distances
+]
+figure, ax = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+for label, count, style in (("the image", 1, "k-"), ("the image and its ghosts", orders, "k--")):
+    fields = [field_of_view(one, orders=count).vertical_deg for one in whole]
+    found = np.interp(-34.3, -np.array(fields), distances)
+    print(f"vertical field of {label}: 34.3 degrees at d1 = {found:.1f} mm")
+    ax.plot(distances, fields, style, label=label)
+    ax.plot(found, 34.3, "ko")
+    ax.annotate(f"{found:.1f} mm", (found, 34.3), xytext=(6, 6), textcoords="offset points")
+ax.axhline(34.3, color="0.6", linewidth=1, label="34.3° (thesis)")
+ax.set(xlabel="d1, from the lens to the plate (mm)", ylabel="vertical field of view (degrees)")
+ax.legend(loc="lower left")
+figure.savefig(FIGURES / "field_of_view.png", dpi=110)
+assert 29 < found < 29.3
 
 # %%
 # Colours and ghosts over the field

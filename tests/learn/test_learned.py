@@ -112,6 +112,13 @@ def test_what_it_cannot_do_is_told_in_a_line():
             tc.reconstruct(recording(distance), Learned(network))
     with pytest.raises(ValueError, match="distance = 49 mm lies outside"):
         network.focus(recording().captures[0], 49.0, 0.01)
+    capture, map_ = recording().captures[0], np.full((32, 32), 80.0)
+    with pytest.raises(ValueError, match=r"shape \(32, 32\); a lens has one focus: give one"):
+        network.focus(capture, map_, 0.01)
+    with pytest.raises(ValueError, match=r"shape \(32, 32\); give a list of them, such as"):
+        network.sweep(capture, map_, 0.01)
+    for image in (network.sweep(capture, [60, 120], 0.01)[1], network.all_in_focus(capture, 0.01)):
+        assert image.shape == network.camera.field_shape
     with pytest.raises(ValueError, match=r"captures have shape \(18, 16\)"):
         network.focus(jnp.ones((18, 16)), 80.0, 0.01)
     with pytest.raises(ValueError, match="takes every pixel of a capture"):

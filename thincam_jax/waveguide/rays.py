@@ -24,7 +24,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.precision import product
-from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
+from thincam_jax.waveguide.camera import Rectangle, Screen, SeeThroughCamera
 from thincam_jax.waveguide.efficiency import weights_about
 from thincam_jax.waveguide.hologram import directions
 
@@ -96,24 +96,15 @@ def _trace(
     found = bragg_rays(camera, pixels)
     wavelength, guided, fault = found.wavelength, found.guided, found.fault
     path = object_points(camera, found, distance, orders)
-    top, bottom, ended = path.top, path.bottom, path.ended
-
-    on_top = True if screen.top is None else screen.top.holds(top)
-    on_bottom = True if screen.bottom is None else screen.bottom.holds(bottom)
-    met = True if extent is None else extent.holds(ended)
-    status = jnp.where(met, int(RayStatus.OK), int(RayStatus.MISSED))
-    status = jnp.where(on_bottom & on_top, status, int(RayStatus.OFF_HOLOGRAM))
-    status = jnp.where(fault == RayStatus.OK, status, fault)
-    status = jnp.broadcast_to(status, bottom.shape[:-1])
-
+    status = ray_status(screen, fault, path, extent)
     weight = weights_about(screen.hologram, found.across, wavelength, orders)
     if screen.bottom is not None:
         # Only contacts with the hologram take a part of the light away.
-        contacts = jnp.asarray(on_bottom).astype(int)
+        contacts = screen.bottom.holds(path.bottom).astype(int)
         weight = jnp.take_along_axis(weight, jnp.cumsum(contacts, axis=0) - contacts, axis=0)
     end = camera.focal_distance + camera.lens_distance + screen.glass_thickness + distance
-    depth = jnp.broadcast_to(end, (*ended.shape[:-1], 1)).astype(ended.dtype)
-    points = jnp.concatenate([ended[..., ::-1], depth], axis=-1)
+    depth = jnp.broadcast_to(end, (*path.ended.shape[:-1], 1)).astype(path.ended.dtype)
+    points = jnp.concatenate([path.ended[..., ::-1], depth], axis=-1)
     return Rays(points, wavelength, jnp.where(status == RayStatus.OK, weight, 0), guided, status)
 
 
@@ -183,6 +174,19 @@ def object_points(
     moved = on_object(camera, rays.slope, guided + 2 * width * crossing)
     places = top, top + guided, straight_on(camera, rays.slope, distance) + moved
     return RayPath(*(place[..., ::-1] for place in places))
+
+
+def ray_status(
+    screen: Screen, fault: Int[Array, "*pixel"], path: RayPath, extent: Rectangle | None = None
+) -> Int[Array, "order *pixel"]:
+    """How rays of a fault up to the top hologram end, on an object of that extent."""
+    on_top = True if screen.top is None else screen.top.holds(path.top)
+    on_bottom = True if screen.bottom is None else screen.bottom.holds(path.bottom)
+    met = True if extent is None else extent.holds(path.ended)
+    status = jnp.where(met, int(RayStatus.OK), int(RayStatus.MISSED))
+    status = jnp.where(on_bottom & on_top, status, int(RayStatus.OFF_HOLOGRAM))
+    status = jnp.where(fault == RayStatus.OK, status, fault)
+    return jnp.broadcast_to(status, path.bottom.shape[:-1])
 
 
 def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:

@@ -19,6 +19,7 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.waveguide.commands.run import build_cameras, build_screen, run_screen
+from thincam_jax.waveguide.field_of_view import field_of_view
 from thincam_jax.waveguide.rays import RayStatus
 from thincam_jax.waveguide.studies.calibration import MEASURED, calibrate
 
@@ -103,6 +104,18 @@ def test_a_file_of_a_colour_sensor(tmp_path):
     config = tiny.experiment(tmp_path, *colours, RESPONSES, face, "calibration.distances=[]")
     study = build_screen(config)
     assert study.responses[1].centre == pytest.approx(535e-6) and len(study.responses) == 3
+
+
+@pytest.mark.thorough
+def test_field_of_view_is_in_the_metrics_and_on_the_page(run):
+    study, path, metrics, _ = run
+    told = metrics["rays"]
+    for name, orders in (("field_of_view", 1), ("field_with_ghosts", study.orders)):
+        assert told[name] == asdict(field_of_view(study.camera, orders=orders))
+    page = (path / "report.html").read_text("utf-8")
+    # 22 × 30 pixels of 70.4 µm, 6 mm before the lens.
+    expected = "Field of view, vertical × horizontal: 14.7° × 20.0°, with ghosts 14.7° × 20.0°."
+    assert expected in page
 
 
 @pytest.mark.thorough

@@ -20,6 +20,7 @@ from thincam_jax.waveguide.design.plate import (
     judge_plate,
     noise_variance,
 )
+from thincam_jax.waveguide.field_of_view import field_of_view
 
 # 10×10 cells of 15 mm; pixels that see 6.6 mm of the object.
 VIEWING = Viewing(tc.Sensor((30, 30), 70.4 * um), cell=15.0)
@@ -98,3 +99,47 @@ def test_limits_that_cross_are_refused():
     limits = PlateLimits(changed(index_modulation=0.03), Plate())
     with pytest.raises(ValueError, match="limits of index_modulation are 0.03 to 0.02; give the"):
         find_plate(VIEWING, limits, key=jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {},  # the sensor's edges
+        {"focal_distance": 0.8, "reference_angle": 46 * deg},  # the critical angle on one side
+        {"focal_distance": 0.8, "reference_angle": 80 * deg},  # grazing light on the other
+        {"reference_angle": 35 * deg},  # nothing
+    ],
+)
+def test_field_of_view_is_that_of_traced_rays(numbers):
+    plate = changed(**numbers)
+    traced = field_of_view(plate.camera(VIEWING.sensor)).vertical_deg
+    assert float(judge_plate(plate, VIEWING).field_of_view) / deg == pytest.approx(traced, abs=0.05)
+
+
+@pytest.mark.thorough
+def test_a_plate_with_a_least_field_of_view():
+    lower = changed(reference_angle=45 * deg, focal_distance=2.0)
+    upper = changed(reference_angle=85 * deg, focal_distance=10.0)
+    wide = dataclasses.replace(VIEWING, field_of_view=50 * deg)
+    settings = {"key": jax.random.key(0), "starts": 1, "samples": 4, "steps": 4}
+    found = [find_plate(v, PlateLimits(lower, upper), **settings).plate for v in (VIEWING, wide)]
+    narrow, asked = (field_of_view(one.camera(VIEWING.sensor)).vertical_deg for one in found)
+    assert narrow < 45 and asked > 49.97
+
+
+@pytest.mark.parametrize(
+    ("numbers", "part"),
+    [
+        ({}, "limits of focal_distance are 6 to 6 mm; a field of view of 50 deg takes 0 to 2.265"),
+        (
+            {"focal_distance": 2.0, "reference_angle": 50 * deg},
+            "limits of reference_angle are 50 to 50 deg; a field .* takes 58.17 to 73.64 deg;",
+        ),
+    ],
+)
+def test_limits_without_the_field_of_view_are_refused(numbers, part):
+    end, wide = changed(**numbers), dataclasses.replace(VIEWING, field_of_view=50 * deg)
+    with pytest.raises(ValueError, match=part):
+        find_plate(wide, PlateLimits(end, end), key=jax.random.key(0))
+    with pytest.raises(ValueError, match="field_of_view = 4 rad; give 0 for any, or less than π"):
+        dataclasses.replace(VIEWING, field_of_view=4.0)

@@ -229,13 +229,28 @@ class RefocusNetwork(eqx.Module):
     def focus(
         self, captures: Numbers, distance: Number, noise_std: Numbers
     ) -> Float[Array, "*batch y x"]:
-        """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them."""
+        """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them.
+
+        **Errors**: ValueError for a distance out of range, and for a map of distances.
+        """
+        if (shape := jnp.asarray(distance).shape)[1:]:
+            raise ValueError(
+                f"distance has shape {shape}; a lens has one focus: give one distance "
+                "in mm, several to sweep, or take all_in_focus for an image sharp everywhere"
+            )
         return _batched("image", self, captures, noise_std, self.camera.within(distance))
 
     def sweep(
         self, captures: Numbers, distances: Numbers | Sequence[Number], noise_std: Numbers
     ) -> Float[Array, "distance *batch y x"]:
-        """`focus` at each of `distances`."""
+        """`focus` at each of `distances`, mm, (distance,).
+
+        **Errors**: ValueError for a distance out of range, and for other than a list of them.
+        """
+        if len(shape := jnp.asarray(distances).shape) != 1:
+            raise ValueError(
+                f"distances have shape {shape}; give a list of them, such as [60, 120] mm"
+            )
         distances = self.camera.within(distances)
         images = _batched("image", self, captures, noise_std, distances)
         return jnp.moveaxis(images, -3, 0)

@@ -16,6 +16,7 @@ object, and what changes over a few ghosts' distance, are left out.
 """
 
 import functools
+import math
 from dataclasses import replace
 
 import equinox as eqx
@@ -47,6 +48,8 @@ _FREQUENCIES = (32, 16)
 # Of n sin Θ′ above the critical angle's 1, where half of the light counts: a descent feels the end
 # of the guided range before it, where the true loss is a step without a slope.
 _MARGIN = 0.02
+# Of the glass and the film.
+_INDEX = 1.5
 
 
 class Plate(Module):
@@ -71,7 +74,11 @@ class Plate(Module):
     )
 
     def camera(
-        self, sensor: Sensor, *, wavelength: Number = 532 * nm, index: AbstractIndex | Number = 1.5
+        self,
+        sensor: Sensor,
+        *,
+        wavelength: Number = 532 * nm,
+        index: AbstractIndex | Number = _INDEX,
     ) -> SeeThroughCamera:
         """The camera with it: object wave along the normal, film and glass of one index."""
         hologram = VolumeHologram.record(
@@ -110,6 +117,8 @@ class Viewing(eqx.Module):
       its light.
     - `mean`, `variance`: moments of the object's radiance. `prior`: how its variance is spread, by
       default `PowerLaw(2.5)`.
+    - `field_of_view`: least one of plates that `find_plate` finds, along y, rad, half of it on
+      either side of the axis; 0 for any.
 
     **Errors**: ValueError, one line, for what is out of range.
     """
@@ -122,6 +131,7 @@ class Viewing(eqx.Module):
     mean: float = 0.5
     variance: float = 0.08
     prior: PowerLaw | None = None
+    field_of_view: float = 0.0
 
     def __check_init__(self):
         for name in ("object_distance", "object_width", "cell"):
@@ -129,13 +139,18 @@ class Viewing(eqx.Module):
         checks.decibels("snr_db", self.snr_db)
         checks.non_negative("mean", self.mean, "a ratio")
         checks.positive("variance", self.variance, "a ratio")
+        if not 0 <= self.field_of_view < math.pi:
+            raise ValueError(
+                f"field_of_view = {self.field_of_view:g} rad; give 0 for any, or less than π"
+            )
 
 
 class Judged(Module):
     """A plate's worth.
 
     - `error`: expected, as a part of the object's variance. `light`: mean weight ∑W_i, mm.
-    - `field_of_view`: along y, rad. `ghost`: mean distance of the first ghost, mm on the object.
+    - `field_of_view`: along y, rad, to the sensor's edges or to where the glass guides no light;
+      holograms are as large as that needs. `ghost`: mean distance of the first, mm on the object.
     - `ghost_light`: part of the light that comes by ghosts.
     """
 
@@ -181,16 +196,54 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     imaginary = jnp.sum(jnp.sum(jnp.sin(turns), axis=2) * shares, axis=0)
     known = density * (real**2 + imaginary**2) / noise
     error = jnp.mean(jnp.sum(density / (1 + known), axis=-1)) / jnp.sum(density)
-    half = pitch * viewing.sensor.shape[0] / 2
     middle = jnp.mean(rays.points, axis=2)
     ghost = jnp.mean(jnp.sqrt(jnp.sum((middle[1] - middle[0]) ** 2, axis=-1)))
     behind = jnp.mean(jnp.sum(rays.weight[1:], axis=0)) / light
-    return Judged(error, light, 2 * jnp.arctan(half / plate.focal_distance), ghost, behind)
+    return Judged(error, light, _field_of_view(plate, viewing.sensor), ghost, behind)
+
+
+def _field_of_view(plate: Plate, sensor: Sensor) -> Float[Array, ""]:
+    """Angle along y within the sensor's edges, the critical angle and 90° in the glass, rad."""
+    edge = jnp.sin(jnp.arctan(sensor.pitch * sensor.shape[0] / 2 / plate.focal_distance))
+    least = math.asin(1 / _INDEX)
+    ends = plate.reference_angle - least, math.pi / 2 - plate.reference_angle
+    sines = (jnp.clip(_INDEX * jnp.sin(end), -edge, edge) for end in ends)
+    return jnp.maximum(sum(jnp.arcsin(sine) for sine in sines), 0)
+
+
+def _with_field_of_view(limits: PlateLimits, viewing: Viewing) -> PlateLimits:
+    """The limits within which plates have at least the field of view that is asked for.
+
+    **Errors**: ValueError where none has.
+    """
+    if not viewing.field_of_view:
+        return limits
+    half = viewing.field_of_view / 2
+    farthest = float(viewing.sensor.pitch) * viewing.sensor.shape[0] / 2 / math.tan(half)
+    across = math.asin(math.sin(half) / _INDEX)
+    lower, upper = limits.lower, limits.upper
+    allowed = {
+        "focal_distance": (0.0, farthest),
+        "reference_angle": (math.asin(1 / _INDEX) + across, math.pi / 2 - across),
+    }
+    for name, (least, most) in allowed.items():
+        low, high = float(getattr(lower, name)), float(getattr(upper, name))
+        if max(low, least) > min(high, most):
+            unit, scale = ("mm", 1) if name == "focal_distance" else ("deg", deg)
+            raise ValueError(
+                f"limits of {name} are {low / scale:.4g} to {high / scale:.4g} {unit}; a field of "
+                f"view of {viewing.field_of_view / deg:.4g} deg takes {least / scale:.4g} to "
+                f"{most / scale:.4g} {unit}; give limits that reach there, or a smaller field"
+            )
+        dtype = getattr(lower, name).dtype
+        lower = replace(lower, **{name: jnp.asarray(max(low, least), dtype)})
+        upper = replace(upper, **{name: jnp.asarray(min(high, most), dtype)})
+    return PlateLimits(lower, upper)
 
 
 def _rays(plate: Plate, viewing: Viewing):
     """Rays from pixels over the field: points (order, pixel, sample, 2), weights (order, pixel)."""
-    camera = plate.camera(viewing.sensor)
+    camera = plate.camera(viewing.sensor, index=_INDEX)
     rows, columns = viewing.sensor.shape
     along = [(np.arange(n) + 0.5) / n for n in _FIELD]
     y, x = (2 * along[0] - 1) * rows / 2, along[1] * columns / 2
@@ -226,7 +279,11 @@ def find_plate(
 ) -> FoundPlate:
     """The plate of least expected error within limits, by Adam from the best of even samples.
 
-    **Errors**: ValueError for limits that cross, and for counts below 1.
+    Plates have at least `viewing.field_of_view`: this narrows the limits of focal distance (the
+    sensor's edges) and recording angle (light in the glass from the critical angle to 90°).
+
+    **Errors**: ValueError for limits that cross, or within which no plate has that field of view,
+    and for counts below 1.
     """
     key = random_key(key)
     checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
@@ -236,6 +293,7 @@ def find_plate(
             raise ValueError(
                 f"limits of {name} are {low:g} to {high:g}; give the lower one first, above 0"
             )
+    limits = _with_field_of_view(limits, viewing)
     dtype = limits.lower.glass_thickness.dtype
     points = even_samples(6, max(samples, starts), key, dtype)
     values = np.asarray(_errors(limits, viewing, points))

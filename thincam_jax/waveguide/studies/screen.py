@@ -34,6 +34,7 @@ from thincam_jax.studies.pictures import (
 )
 from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.colours import colour_system
+from thincam_jax.waveguide.field_of_view import FieldOfView, field_of_view
 from thincam_jax.waveguide.hologram import directions
 from thincam_jax.waveguide.rays import Rays, RayStatus, bragg_rays, pixel_centres
 from thincam_jax.waveguide.smear import SmearedRays
@@ -398,6 +399,8 @@ class RaySummary:
 
     - `first_ghost_down_mm`, `first_ghost_right_mm`: displacement of what a pixel sees by it. None
       where there is one order only, or no ray.
+    - `field_of_view`: extreme angles of the image itself; `field_with_ghosts`: those of all orders.
+      A full-colour hologram's are those of green, a mask's those through its middle.
     """
 
     wavelength_nm: tuple[float, float] | None
@@ -405,9 +408,11 @@ class RaySummary:
     first_ghost_down_mm: tuple[float, float] | None
     first_ghost_right_mm: tuple[float, float] | None
     status_percent: dict[str, float]
+    field_of_view: FieldOfView
+    field_with_ghosts: FieldOfView
 
     def __str__(self) -> str:
-        """Summary in two sentences; empty where no ray reaches the object."""
+        """Summary in three sentences; empty where no ray reaches the object."""
         if self.wavelength_nm is None or self.guided_angle_deg is None:
             return ""
         colours, angles, ghost = self.wavelength_nm, self.guided_angle_deg, ""
@@ -418,12 +423,13 @@ class RaySummary:
         ended = (f"{kind.replace('_', ' ')} {part} %" for kind, part in self.status_percent.items())
         return (
             f"{colours[0]:.0f} to {colours[1]:.0f} nm, guided at {angles[0]:.1f}° to "
-            f"{angles[1]:.1f}°{ghost}. Rays: {', '.join(ended)}."
+            f"{angles[1]:.1f}°{ghost}. Rays: {', '.join(ended)}. Field of view, vertical × "
+            f"horizontal: {self.field_of_view}, with ghosts {self.field_with_ghosts}."
         )
 
 
 def summarise_rays(study: ScreenStudy, rays: Rays) -> RaySummary:
-    """Colours, angles of the guided light, shifts of the first ghost, and how rays ended."""
+    """Colours, guided angles, shifts of the first ghost, how rays ended, and the field of view."""
     status = np.asarray(rays.status)
     index = np.asarray(study.camera.screen.glass_index(rays.wavelength))
     sines = np.sqrt(np.sum(np.asarray(rays.guided) ** 2, axis=-1)) / index
@@ -443,4 +449,5 @@ def summarise_rays(study: ScreenStudy, rays: Rays) -> RaySummary:
         for kind in RayStatus
         if (status == kind).any()
     }
-    return RaySummary(found[0], found[1], found[2], found[3], endings)
+    fields = (field_of_view(study.camera, orders=count) for count in (1, study.orders))
+    return RaySummary(found[0], found[1], found[2], found[3], endings, *fields)
