@@ -186,7 +186,8 @@ for distance in distances:
         wanted = kernels[distance, "grey"]
         error = np.linalg.norm(kernel - wanted) / np.linalg.norm(wanted)
         errors[distance, name] = error
-        print(f"d = {distance} mm, {name}: PSF {error:.0%} off, photograph {quality:.1f} dB")
+        image = f", photograph {quality:.1f} dB" if imaged else ""
+        print(f"d = {distance} mm, {name}: PSF {error:.0%} off{image}")
 
 for distance in distances:
     coarse, fine = (errors[distance, (cell, "amplitude")] for cell in (cells[0], cells[-1]))
