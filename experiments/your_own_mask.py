@@ -17,7 +17,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
+from thincam_jax.imaging.metrics import psnr
+from thincam_jax.imaging.targets import sample_image
 from thincam_jax.lensless.masks import AxisFactors, MaskTerms
+from thincam_jax.lensless.masks.halftone import DENSITIES, halftone
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in seconds
@@ -140,3 +143,77 @@ assert signal(best) >= 0.999 * signals.max()
 drawn = GolombSlits(best, 48 * um)
 layout = tc.design.write_gds(FIGURES / "golomb.gds", drawn, smallest_feature=2 * um)
 assert layout.stat().st_size > 0
+
+# %%
+# A grey plate
+# ------------
+#
+# Lithography opens a cell or leaves it closed. `halftone` spreads the grey of a cosine zone plate
+# over such cells, and the exact PSF of these says what that costs. The open fraction is the grey
+# plate's amplitude transmittance or its irradiance; PSFs are compared over all pixels, images with
+# the photograph after a gain and an offset. The τ is the better of two for each plate.
+
+side, cells, distances = (1.6, (8, 4, 2), (2.0, 6.5)) if SIZE == "full" else (0.64, (16, 8), (6.5,))
+sensor = tc.Sensor((128, 144) if SIZE == "full" else (48, 56), 20 * um)
+grey = tc.FresnelZoneAperture(160.0 / side, width=side)
+plates = {"grey": grey, "binary": tc.FresnelZoneAperture(grey.beta, width=side, profile="binary")}
+plates |= {(cell, kind): halftone(grey, cell * um, kind) for kind in DENSITIES for cell in cells}
+photograph = sample_image("camera", linear=True)
+
+
+def psf_and_psnr(plate, distance, reconstructed):
+    """The plate's PSF, and the PSNR of the photograph behind it, dB, where it is asked for."""
+    own = tc.LenslessCamera(plate, sensor, distance)
+    many = isinstance(plate, tc.SampledMask)  # fine cells scatter: many samples of a pixel
+    model = tc.PsfMethod("separable", nodes=144) if many else "separable"
+    kernel = np.asarray(tc.psf(own, wavelength=WAVELENGTH, object_distance=300.0, model=model))
+    if not reconstructed:
+        return kernel, np.nan
+    plane = tc.ImagePlane(photograph, 300.0, 0.75 * side * 300.0 / distance)
+    recording = tc.record(own, tc.Scene(plane, WAVELENGTH), noise=40.0, model=model)
+    found = [tc.reconstruct(recording, tc.AdmmTV(tau)) for tau in (0.3, 1.0)]
+    grid = tc.Grid(found[0].image.shape[-2:], found[0].pitch)
+    truth = np.asarray(plane.sample(grid, magnification=1.0))
+    return kernel, max(psnr(np.squeeze(one.image), truth) for one in found)
+
+
+kernels, errors = {}, {}
+for distance in distances:
+    for name, plate in plates.items():
+        imaged = SIZE == "full" and (name in ("grey", "binary") or name[0] == cells[1])
+        kernel, quality = psf_and_psnr(plate, distance, imaged)
+        kernels[distance, name] = kernel
+        wanted = kernels[distance, "grey"]
+        error = np.linalg.norm(kernel - wanted) / np.linalg.norm(wanted)
+        errors[distance, name] = error
+        image = f", photograph {quality:.1f} dB" if imaged else ""
+        print(f"d = {distance} mm, {name}: PSF {error:.0%} off{image}")
+
+for distance in distances:
+    coarse, fine = (errors[distance, (cell, "amplitude")] for cell in (cells[0], cells[-1]))
+    assert fine < coarse
+
+# %%
+# The plate goes to the shop as GDS and, for a look, as PNG, a pixel a cell.
+
+chosen = plates[cells[1], "amplitude"]
+tc.design.write_gds(FIGURES / "plate.gds", chosen, smallest_feature=cells[1] * um)
+tc.measured.write_image(FIGURES / "plate_cells.png", np.asarray(chosen.amplitude)[None])
+
+figure, panels = plt.subplots(1, 4, figsize=(12, 3.3), layout="constrained")
+near = tc.Grid((300, 300), side / 600)  # the middle of the plate, half as wide
+parts = {"grey plate": grey.sample(near), f"cells of {cells[1]} µm": chosen.sample(near)}
+for ax, (name, image) in zip(panels, parts.items(), strict=False):
+    ax.imshow(image, cmap="gray", extent=(-side / 4, side / 4, side / 4, -side / 4), vmin=0, vmax=1)
+    ax.set(title=name, xlabel="x (mm)", ylabel="y (mm)")
+x, row = np.asarray(sensor.grid.x), sensor.shape[0] // 2
+for ax, distance in zip(panels[2:], (distances[0], distances[-1]), strict=True):
+    lines = {"grey": ("k", "-"), (cells[1], "amplitude"): ("0.4", "--")}
+    lines |= {(cells[1], "irradiance"): ("0.6", "-.")}
+    for name, (level, dashes) in lines.items():
+        label = name if name == "grey" else f"{name[0]} µm, {name[1]}"
+        ax.plot(x, kernels[distance, name][row], color=level, linestyle=dashes, label=label)
+    ax.set(xlim=(0, side / 2), xlabel="x on the sensor (mm)", ylabel="PSF (open aperture = 1)")
+    ax.set(title=f"d = {distance} mm", ylim=(0, None))
+panels[3].legend(fontsize=8)
+figure.savefig(FIGURES / "halftone.png", dpi=100)

@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import klayout.db
 import numpy as np
 import PIL.Image
@@ -90,7 +91,11 @@ def test_what_is_too_fine_is_refused_and_the_advice_holds(tmp_path):
     ("mask", "error", "message"),
     [
         (tc.SampledMask([[0.5, 1.0]], pitch=0.1), ValueError, "grey or complex parts"),
-        (tc.FresnelZoneAperture(25.0, width=1.6), ValueError, "'cosine' is grey; give 'binary'"),
+        (
+            tc.FresnelZoneAperture(25.0, width=1.6),
+            ValueError,
+            "'cosine' is grey; give 'binary', or ",
+        ),
         (
             tc.FresnelZoneAperture(25.0, width=1.6, profile="binary", pixel_pitch=0.1),
             TypeError,
@@ -109,6 +114,23 @@ def test_other_masks_are_refused(mask, error, message, tmp_path):
         tc.design.write_gds(tmp_path / "mask.gds", mask)
     with pytest.raises(ValueError, match="layouts are written as .gds"):
         tc.design.write_gds(tmp_path / "mask.png", MASKS["disc"])
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_a_grey_plate_is_written_in_cells(double, tmp_path):
+    """As the refusal advises; every cell is read back, and is as wide as the shop's finest."""
+    with jax.enable_x64(double):
+        grey = tc.FresnelZoneAperture(150.0, 0.4, width=0.48, height=0.32, centre=CENTRE)
+        with pytest.raises(
+            ValueError, match=r"its tc\.lensless\.masks\.halftone\.halftone\(mask, "
+        ):
+            tc.design.write_gds(tmp_path / "mask.gds", grey)
+        plate = tc.lensless.masks.halftone.halftone(grey, 8 * um)
+        path = tc.design.write_gds(tmp_path / "mask.gds", plate, smallest_feature=8 * um)
+    region = read(path)
+    y, x = ((np.arange(n) - (n - 1) / 2) * 8 * um for n in (40, 60))
+    found = [[open_area(region, b - 0.12, a + 0.05, 8 * um) for b in x] for a in y]
+    np.testing.assert_allclose(found, plate.amplitude, atol=1e-3)
 
 
 HEIGHT = np.random.default_rng(0).integers(0, 4, (5, 7)) * 0.4 * um

@@ -21,6 +21,7 @@ Tone = Literal["open", "opaque"]
 TONES: tuple[Tone, ...] = get_args(Tone)
 # µm a mm; µm by which a polygon may miss a circle, and of the file's database unit.
 _MICROMETRES, _CHORD, _UNIT = 1e3, 0.01, 1e-3
+_HALFTONE = "its tc.lensless.masks.halftone.halftone(mask, cell)"
 
 
 @checked
@@ -37,13 +38,15 @@ def write_gds(
 
     Masks of cells that are open or closed (`SampledMask`, MURA, URA, separable, `Pinhole`), rings
     (`RadialMask`) and the binary `FresnelZoneAperture`, whose zones are cut off by its sides as
-    they are, without the Fourier series of the model. x points right and y up: rows of the mask
-    run downwards, as in its picture. Circles are polygons within 10 nm. A `Mosaic` is one layout of
-    all its masks at their places.
+    they are, without the Fourier series of the model. A grey mask is written as its
+    `lensless.masks.halftone.halftone(mask, cell)`. x points right and y up: rows of the mask run
+    downwards, as in its picture. Circles are polygons within 10 nm. A `Mosaic` is one layout of all
+    its masks at their places.
 
     **Arguments**
 
-    - `tone`: parts that are drawn, the open ones or, within the mask's extent, the opaque ones.
+    - `tone`: parts that are drawn, the open ones or, within the mask's extent, the opaque ones;
+      slow for 10⁵ cells and more.
     - `layer`, `cell`: number of the layer, of data type 0, and name of the cell.
     - `smallest_feature`: the finest line that can be written, mm: a mask with a finer open or
       opaque part is refused. Along rows, columns and radii; corners are not measured.
@@ -60,7 +63,7 @@ def write_gds(
     tc.design.write_gds("mura.gds", mask, smallest_feature=2 * um)
     ```
 
-    **See also**: `write_stl`, `write_height_map`.
+    **See also**: `lensless.masks.halftone.halftone`, `write_stl`, `write_height_map`.
     """
     try:
         import gdstk  # an extra
@@ -74,7 +77,7 @@ def write_gds(
     parts = [part for drawn, _ in drawings for part in drawn]
     finest = min(width for _, width in drawings)
     least = 0.0 if smallest_feature is None else float(np.asarray(smallest_feature))
-    if finest < least * (1 - 1e-6):
+    if finest < least - _UNIT / _MICROMETRES / 2:
         raise ValueError(
             f"the mask's finest part is {finest * _MICROMETRES:.3g} µm wide; give a coarser mask, "
             f"or smallest_feature of at most {finest:.3g} mm"
@@ -121,7 +124,10 @@ def _zones(mask: AbstractMask) -> tuple[np.ndarray, bool] | None:
     if not isinstance(mask, FresnelZoneAperture) or mask.pixels is not None:
         return None
     if mask.profile != "binary":
-        raise ValueError(f"a zone aperture of the profile {mask.profile!r} is grey; give 'binary'")
+        raise ValueError(
+            f"a zone aperture of the profile {mask.profile!r} is grey; give 'binary', or "
+            f"{_HALFTONE}"
+        )
     beta, phase = float(mask.beta), float(mask.phase)
     farthest = beta * sum((float(side) / 2) ** 2 for side in mask.extent) + phase
     # The cosine changes its sign at odd multiples of π/2.
@@ -151,7 +157,7 @@ def _rings(gdstk: Any, mask: AbstractMask, radii: np.ndarray, middle: bool) -> t
 
 
 def _cells(gdstk: Any, mask: AbstractMask) -> tuple[list, float]:
-    """Rectangles of open cells, joined, and the shortest run of cells, mm."""
+    """Rectangles of open cells, equal runs of rows joined, and the shortest run of cells, mm."""
     if not isinstance(mask, AbstractFactoredMask):
         raise TypeError(
             f"a {type(mask).__name__} has no layout of polygons; give a binary mask of cells, "
@@ -161,7 +167,7 @@ def _cells(gdstk: Any, mask: AbstractMask) -> tuple[list, float]:
         raise TypeError("a display shows the zones in its pixels; leave out pixel_pitch")
     terms = mask.terms()
     rows, columns = (np.asarray(f.values) for f in (terms.rows, terms.columns))
-    values = np.einsum("k,ki,kj->ij", np.asarray(terms.coefficients), rows, columns)
+    values = (np.asarray(terms.coefficients)[:, None] * rows).T @ columns
     cells = _binary(values).astype(bool)
     down, right = (
         (np.asarray(factors.edges, float) + float(middle)) * _MICROMETRES
@@ -169,13 +175,16 @@ def _cells(gdstk: Any, mask: AbstractMask) -> tuple[list, float]:
             (terms.rows, terms.columns), np.asarray(mask.centre), strict=True
         )
     )
-    runs = [(i, *ends) for i, row in enumerate(cells) for ends in zip(*_ends(row), strict=True)]
-    rectangles = [
-        gdstk.rectangle((right[first], -down[i]), (right[end], -down[i + 1]))
-        for i, first, end in runs
-    ]
+    rectangles, begun = [], {}  # first row of the runs that go on
+    for i, row in enumerate([*cells, np.zeros_like(cells[0])]):
+        runs = dict.fromkeys(zip(*_ends(row), strict=True), i)
+        for run in begun.keys() - runs.keys():
+            first, end = run
+            corners = (right[first], -down[begun.pop(run)]), (right[end], -down[i])
+            rectangles.append(gdstk.rectangle(*corners))
+        begun = runs | begun
     finest = min(_shortest(cells, right), _shortest(cells.T, down)) / _MICROMETRES
-    return gdstk.boolean(rectangles, [], "or", precision=_UNIT), finest
+    return rectangles, finest
 
 
 def _ends(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -196,5 +205,8 @@ def _shortest(lines: np.ndarray, edges: np.ndarray) -> float:
 def _binary(values: np.ndarray) -> np.ndarray:
     found = np.round(np.real(values))
     if np.abs(values - found).max() > 1e-6 or not np.isin(found, (0, 1)).all():
-        raise ValueError("the mask has grey or complex parts; give transmittances of 0 and 1")
+        raise ValueError(
+            "the mask has grey or complex parts; give transmittances of 0 and 1, or, of a grey "
+            f"one, {_HALFTONE}"
+        )
     return found
