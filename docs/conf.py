@@ -126,6 +126,7 @@ MODULES = (
     "lensless.exposures",
     "lensless.forward",
     "lensless.masks.display",
+    "lensless.masks.halftone",
     "lensless.masks.phase",
     "lensless.phase_shift",
     "lensless.propagation.angular_spectrum",

@@ -19,6 +19,7 @@ from thincam_jax.commands.config_file import ConfigError, Places
 from thincam_jax.commands.kinds import KINDS
 from thincam_jax.commands.schema import Section
 from thincam_jax.hardware.base import Region
+from thincam_jax.lensless.exposures import Layout
 from thincam_jax.waveguide import Rectangle
 
 WRONG_UNIT = "5.5 kg"
@@ -141,7 +142,7 @@ def test_constructors_of_sections_state_ranges_and_blame_a_field(maker):
     parameters, known = inspect.signature(maker).parameters, quantities(maker)
     for key in {key for keys in made for key in keys} - set(known):
         stated = parameters[key].annotation  # a type that says which values there are, or a name
-        records = Region | None, Rectangle | None  # which have sections of their own
+        records = Region | None, Rectangle | None, Layout | None  # which have sections of their own
         assert stated in (bool, str, *records) or get_origin(stated) is Literal, key
     tree = ast.parse(textwrap.dedent(inspect.getsource(maker)))
     for body in ast.walk(tree):

@@ -71,6 +71,7 @@ def test_psf_without_walls_is_that_of_the_summed_fields():
     assert relative_l2(value, apart) > 5e-3  # at the pixels' centres their light interferes
 
 
+@pytest.mark.thorough
 def test_pixels_average_the_interference_away():
     whole = mosaic(None).whole
     assert isinstance(whole.mask, SideBySide)
@@ -85,7 +86,7 @@ def test_pixels_average_the_interference_away():
     assert relative_l2(shadow, sum(shadows)) < 1e-9
 
 
-@pytest.mark.parametrize("wall", [0.1, None])
+@pytest.mark.parametrize("wall", [0.1, pytest.param(None, marks=pytest.mark.thorough)])
 def test_parts_are_cameras_of_one_scene(wall):
     """A frame, split, is what the parts' cameras capture."""
     one = mosaic(wall)
