@@ -157,7 +157,7 @@ class Spectrum(Module):
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
     @property
-    def colours(self) -> list[tuple[Number, Number]]:
+    def colours(self) -> list[tuple[Any, Any]]:
         """Pairs of wavelength, mm, and weight."""
         return list(zip(*map(checks.each, (self.wavelengths, self.weights)), strict=True))
 
