@@ -118,7 +118,10 @@ def test_smooth_misfit_does_not_end_the_iterations_at_the_coarse_image():
     y, x = np.meshgrid(np.linspace(-1, 1, 192), np.linspace(-1, 1, 196), indexing="ij")
     shading = 0.02 * (np.sin(1.7 * y + 0.3) + 0.7 * np.cos(2.9 * x - 1))
     noise = light.std() * 10**-1.5 * np.random.default_rng(0).standard_normal(light.shape)
-    result = tc.reconstruct(tc.Recording([light * (1 + shading) + noise], optics), tc.AdmmTV())
+    recording = tc.Recording([light * (1 + shading) + noise], optics)
+    result = tc.reconstruct(recording, tc.AdmmTV())
     first, *objectives = [p.objective for p in result.history]
     assert result.status == "converged" and max(objectives) > first
     assert min(objectives) < 0.99 * first
+    short = tc.reconstruct(recording, tc.AdmmTV(iterations=20))  # it rises at the last one
+    assert short.status == "iterations_exhausted" and short.iterations == 20

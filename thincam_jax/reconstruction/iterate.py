@@ -174,6 +174,8 @@ class Schedule:
       over the last two intervals between checks.
     - `still`: or if the image changed by less than this share of it over the last interval, and the
       objective by less than half of that.
+    - `rising`: a run ends, not converged, if from its second check on the objective is above the
+      lowest one by more than this share.
     """
 
     iterations: int
@@ -183,6 +185,7 @@ class Schedule:
     done: int = 0
     settled: float = 0.0
     still: float = 0.0
+    rising: float = 0.0
 
 
 def iterate(
@@ -228,6 +231,8 @@ def iterate(
             is_stopped = callback is not None and callback(progress)
             still = schedule.still > 0 and _is_still(history, last, current, schedule.still)
             last = current
+            if schedule.rising > 0 and not is_stopped and _is_rising(history, schedule.rising):
+                break
             if small or still or _settled(history, schedule.settled):
                 status = "converged"
                 break
@@ -246,6 +251,12 @@ def _settled(history: Sequence[Progress], share: float) -> bool:
     """Whether the objective hardly changed over the last two intervals between checks."""
     last = [p.objective for p in history[-3:]]
     return len(history) > 3 and max(last) - min(last) < share * last[-1]
+
+
+def _is_rising(history: Sequence[Progress], share: float) -> bool:
+    """Whether the last of three objectives or more is above the lowest one."""
+    *before, last = (p.objective for p in history)
+    return len(before) > 1 and last > (1 + share) * min(before)
 
 
 def _is_still(history: Sequence[Progress], before: Image, after: Image, share: float) -> bool:

@@ -28,7 +28,7 @@ from thincam_jax.reconstruction.other_psf import better_psf
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.problem import InverseProblem, compiled_objective
+from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
@@ -60,8 +60,8 @@ _BALANCED = 30
 # How often pixels are made twice as large, and the tolerance there: the image is only a start.
 # From it an image ends that changes by less than this times the tolerance in ten iterations.
 _COARSER, _ROUGH, _STILL = 2, 3e-3, 100.0
-# Iterations after which penalties that suit an image lead away if the objective rises by this.
-_TRIED, _RISEN = 20, 1e-3
+# Rise of the objective, relative, from which on penalties that suit an image lead away.
+_RISEN = 1e-3
 # Variation of an image whose smooth light counts less, in parts of the first one's, below which it
 # is taken: 0.35 to 0.85 where shading had spoilt detail. That of a real hand is 1.0, with haze.
 _CALMER = 0.92
@@ -362,21 +362,11 @@ class AdmmTV(AbstractRegularised):
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)
         # Penalties are those of the image, and stay: unless they lead away, as from smooth misfit.
-        lowest, rose = float(np.sum(np.asarray(compiled_objective(problem, image)))), []
-
-        def watch(progress):
-            nonlocal lowest
-            is_stopped = callback is not None and callback(progress)
-            is_higher = progress.objective > (1 + _RISEN) * lowest
-            if is_higher and progress.iteration >= _TRIED and not is_stopped:
-                rose.append(progress)
-            lowest = min(lowest, progress.objective)
-            return is_stopped or rose
-
-        schedule = Schedule(self.iterations, self.tolerance, still=_STILL * self.tolerance)
+        still = _STILL * self.tolerance
+        schedule = Schedule(self.iterations, self.tolerance, still=still, rising=_RISEN)
         method = in_parallel(problem, admm_method, image)
-        second = iterate(method, image, schedule, callback=watch)
-        if rose and second.iterations < self.iterations:
+        second = iterate(method, image, schedule, callback=callback)
+        if second.status == "iterations_exhausted" and second.iterations < self.iterations:
             third = self._by_admm(problem, second.image, callback, second.iterations)
             second = _joined(second, third)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
