@@ -65,8 +65,8 @@ class _Line:
         self.first: tuple[int, float] | None = None
         self.now = (0, 0)
         self.stream, self.width = sys.stderr, 0
-        self.notebook, self.output = _notebook(), None
-        self.is_live = self.stream.isatty() or self.notebook is not None
+        self.output = _notebook_output()
+        self.is_live = self.stream.isatty() or self.output is not None
 
     def tell(self, step: int, most: int) -> None:
         self.now = (step, most)
@@ -82,16 +82,17 @@ class _Line:
 
     def show(self, text: str) -> None:
         """Write the text over the one before; nothing over nothing."""
-        if self.notebook and (text or self.output):
-            show = self.output.update if self.output else self.notebook.display
-            other = {} if self.output else {"display_id": True}
-            self.output = show({"text/plain": text}, raw=True, **other) or self.output
-        elif text or self.width:
+        if not text and not self.width:
+            return
+        if self.output is not None:
+            show = self.output.update if self.width else self.output.display
+            show({"text/plain": text}, raw=True)
+        else:
             line = "\r" + text.ljust(self.width) + ("" if text else "\r")
             with contextlib.suppress(OSError, ValueError):  # of a stream that was closed
                 self.stream.write(line)
                 self.stream.flush()
-            self.width = len(text)
+        self.width = len(text)
 
     def __str__(self) -> str:
         spent = f"{self.what}, {time.monotonic() - self.began:.0f} s"
@@ -105,7 +106,7 @@ class _Line:
         return f"{text}, at most {left:.0f} s left"
 
 
-def _notebook() -> Any:
-    """IPython's module of outputs, in a notebook."""
+def _notebook_output() -> Any:
+    """An output below the cell, which can be written again; None where there is no notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return sys.modules["IPython"].display if hasattr(shell, "kernel") else None
+    return sys.modules["IPython"].display.DisplayHandle() if hasattr(shell, "kernel") else None

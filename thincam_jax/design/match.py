@@ -138,7 +138,7 @@ def checked_levels(target: Numbers, rings: int, dtype: DTypeLike) -> Float[Array
                 ring = int(np.argmax(bad))
                 raise ValueError(
                     f"target level of ring {ring + 1} is {known[ring]:g}, {what}; give levels "
-                    "10·log10(1 + ratio) of at least 0 dB, and 0 where none is wanted"
+                    "10·log10(1 + ratio) of at least 0 dB; 0 dB is no response"
                 )
     return levels
 

@@ -1,6 +1,7 @@
 """The image sensor: pixels, noise, saturation and digitisation."""
 
 import abc
+import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -112,6 +113,10 @@ class Sensor(Module):
     def counts(self) -> bool:
         """Whether it is known how many electrons a pixel holds."""
         return self.exposure is not None or self.electrons is not None
+
+
+# Converter of attributes that are a sensor.
+as_sensor = functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
 
 
 class AbstractNoise(Module):

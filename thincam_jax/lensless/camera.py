@@ -14,7 +14,7 @@ from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
-from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.lensless.masks.base import AbstractMask
 
 _positive_or_infinite = functools.partial(checks.positive, unit="mm", allow_infinity=True)
@@ -227,9 +227,7 @@ class LenslessCamera(Module):
             checks.instance, "mask", AbstractMask, "a mask, such as a FresnelZoneAperture"
         )
     )
-    sensor: Sensor = eqx.field(
-        converter=functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
-    )
+    sensor: Sensor = eqx.field(converter=as_sensor)
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     place: Float[Array, "2"] | None = eqx.field(
         default=None, converter=quantity("mm", shape=(2,), optional=True), kw_only=True

@@ -1,7 +1,6 @@
 """Several masks side by side before one sensor: as many captures in one exposure."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
-from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.side_by_side import SideBySide
@@ -85,9 +84,7 @@ class Mosaic(Module):
     """
 
     masks: tuple[tuple[AbstractMask, ...], ...] = eqx.field(converter=_rows)
-    sensor: Sensor = eqx.field(
-        converter=functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
-    )
+    sensor: Sensor = eqx.field(converter=as_sensor)
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     pitch: Float[Array, "2"] | None = eqx.field(
         default=None, converter=quantity("mm", optional=True, check=_pitches), kw_only=True

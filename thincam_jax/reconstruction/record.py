@@ -58,11 +58,8 @@ def record(
 
     **See also**: `capture`, `Recording`, `Scene.photograph`.
     """
-    mosaic = camera if isinstance(camera, Mosaic) else None
-    if isinstance(camera, Mosaic):
-        cameras = list(camera.cameras)
-    else:
-        cameras = [camera] if isinstance(camera, LenslessCamera) else list(camera)
+    exposed: list[Any] = [camera] if isinstance(camera, LenslessCamera | Mosaic) else list(camera)
+    cameras: list[LenslessCamera] = list(camera.cameras) if isinstance(camera, Mosaic) else exposed
     noise = GaussianNoise(noise) if isinstance(noise, float | int) else noise
     distances = [plane.distance for plane in scene.planes]
     light = scene.spectrum
@@ -72,7 +69,7 @@ def record(
         object_distance=distances[0] if len(distances) == 1 else np.unique(distances),
         model=model,
     )
-    key, exposed = random_key(key), cameras if mosaic is None else [mosaic]
+    key = random_key(key)
     keys = [key] if len(exposed) == 1 else jax.random.split(key, len(exposed))
     frames = [
         capture(one, scene, noise=noise, key=k, model=model)
@@ -81,8 +78,8 @@ def record(
     variances = None
     if isinstance(noise, GaussianNoise) and not checks.holds_traced(frames):
         variances = [float(np.mean(np.asarray(noise.variance(one)))) for one in frames]
-    if mosaic is not None:
-        frames = mosaic.split(frames[0])
+    if isinstance(camera, Mosaic):
+        frames = camera.split(frames[0])
         variances = variances and variances * len(frames)
     if not checks.holds_traced(scene, cameras):
         covers = [projected_shape(c, plane) for c in cameras for plane in scene.planes]

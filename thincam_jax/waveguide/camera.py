@@ -18,7 +18,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index
-from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
 
 
@@ -72,9 +72,7 @@ class SeeThroughCamera(Module):
     screen: Screen = eqx.field(
         converter=functools.partial(checks.instance, "screen", Screen, "a waveguide.Screen")
     )
-    sensor: Sensor = eqx.field(
-        converter=functools.partial(checks.instance, "sensor", Sensor, "a thincam_jax.Sensor")
-    )
+    sensor: Sensor = eqx.field(converter=as_sensor)
     focal_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     lens_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     tilt: Float[Array, "2"] = eqx.field(default=None, converter=quantity("rad", check=_tilt))

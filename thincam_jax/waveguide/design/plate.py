@@ -212,7 +212,7 @@ def _field_of_view(plate: Plate, sensor: Sensor) -> Float[Array, ""]:
 
 
 def _with_field_of_view(limits: PlateLimits, viewing: Viewing) -> PlateLimits:
-    """The limits within which plates have at least the field of view that is asked for.
+    """Limits of plates with at least the field of view of `viewing`.
 
     **Errors**: ValueError where none has.
     """
