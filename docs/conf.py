@@ -94,6 +94,8 @@ PACKAGES = (
 )
 # Modules that scripts and pages use beyond these names; versions do not promise them.
 MODULES = (
+    "design.limit",
+    "design.objectives",
     "design.phase_mask",
     "design.phase_retrieval",
     "waveguide.design.plate",
@@ -280,6 +282,7 @@ CARDS = {
     "gradients_through_the_solver": ("solver-gradients.png", 126, 12, 399),
     "in_a_notebook": ("usaf-1951.png", 1182, 326, 186),
     "learned_refocus": ("learned.png", 631, 42, 194),
+    "limit_of_masks": ("limit-spectra.png", 64, 27, 262),
     "mosaic": ("mosaic-psf.png", 58, 33, 350),
     "moving_objects": ("moving-objects.png", 592, 31, 256),
     "optical_chart": ("optical-chart-lines.png", 893, 44, 190),

@@ -21,7 +21,8 @@ from thincam_jax.design import SearchSettings, find_designs
 from thincam_jax.design.design import Design
 from thincam_jax.design.fronts import FrontPoint, FrontSearch, front_point, search_order
 from thincam_jax.design.landscape import Landscape, landscape_if_any
-from thincam_jax.design.objectives import AbstractObjective
+from thincam_jax.design.limit import Limit, limit
+from thincam_jax.design.objectives import AbstractObjective, BayesError
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.ranking import (
     ModulationTransfer,
@@ -214,6 +215,8 @@ class FoundDesigns:
     - `training`: the trained designs; None without training.
     - `random`: the best of `random_designs` random ones, at the cost of the search.
     - `held_out`: the best design and the random one on photographs not trained on.
+    - `limits`: least errors of any masks, of the best linear image with noise that counts
+      electrons; empty otherwise.
     """
 
     objective: AbstractObjective
@@ -229,6 +232,7 @@ class FoundDesigns:
     random: RankedDesign | None = None
     random_designs: int = 0
     held_out: HeldOut | None = None
+    limits: tuple[Limit, ...] = ()
 
 
 class DesignSearch:
@@ -339,7 +343,15 @@ class DesignSearch:
                 self.trained,
                 self.random,
                 self.sampled,
+                limits=_limits(problem),
             )
+
+
+def _limits(problem: DesignProblem) -> tuple[Limit, ...]:
+    counted = isinstance(problem.data.setup.noise, PhotonNoise)
+    if not (counted and isinstance(problem.objective, BayesError)):
+        return ()
+    return limit(problem, "shadow"), limit(problem, "amplitude")
 
 
 @dataclass(frozen=True, eq=False)

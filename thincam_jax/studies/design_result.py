@@ -131,6 +131,7 @@ def _summary(result: DesignResult) -> DesignScores:
         None if found.random is None else _found(objective, found.reference, found.random),
         found.random_designs,
         found.held_out,
+        {one.masks: digits(one.decibels) for one in found.limits},
     )
 
 

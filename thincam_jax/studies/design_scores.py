@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from thincam_jax._core.table import Table, number
@@ -281,6 +281,7 @@ class DesignScores:
     """The figures of merit of a design study: designs, best first, their simulation and fronts.
 
     - `random`: the best of `random_designs` random ones, at the cost of the search.
+    - `limits_db`: least error of any masks of a kind, by its name, as reported.
     """
 
     design: str
@@ -297,6 +298,7 @@ class DesignScores:
     random: Candidate | None = None
     random_designs: int = 0
     held_out: HeldOut | None = None
+    limits_db: dict[str, float] = field(default_factory=dict)
 
     def levels(self) -> str:
         """Design and photographs that the gains refer to, in a sentence."""
@@ -355,6 +357,8 @@ class DesignScores:
         ]
         if best.training_gain_db is not None:
             sentences.append(f"On the training images it gains {best.training_gain_db:+.2f} dB.")
+        if self.limits_db:
+            sentences.append(self._beside_the_limit())
         broken = self.search.broken_limits
         sentences += [f"The reference breaks a limit: {why}." for why in broken]
         if best.active_limits:
@@ -381,6 +385,15 @@ class DesignScores:
                 "only."
             )
         return sentences
+
+    def _beside_the_limit(self) -> str:
+        words = {"shadow": "that cast shadows", "amplitude": "with diffraction"}
+        above = [
+            f"{self.found[0].reported - least:.1f} dB above the limit that no masks {words[masks]} "
+            f"pass ({self.reference.name} {self.reference.reported - least:.1f} dB)"
+            for masks, least in self.limits_db.items()
+        ]
+        return f"{self.found[0].name} is {' and '.join(above)}."
 
     def _beside_others(self) -> list[str]:
         """Random designs beside the found ones, and the gain on further photographs."""

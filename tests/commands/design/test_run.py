@@ -238,9 +238,12 @@ def test_sentences_of_the_report(whole):
         validation=replace(design.validation, one_object_grid=False, methods=methods),
         search=replace(design.search, broken_limits=("β of shot 1 is too much",)),
         found=(replace(design.found[0], active_limits=("beta ≤ 9",)),),
+        limits_db={"shadow": design.found[0].reported - 2.0, "amplitude": -90.0},
     )
+    assert design.limits_db == {}  # noise at an SNR
     told = " ".join(changed.findings())
     for part in (
+        "found 1 is 2.0 dB above the limit that no masks that cast shadows pass (pairs ",
         "at -1.06 dB (28 % more squared error)",
         *("not on one grid", "The reference breaks a limit: β of", "against a limit: beta"),
     ):
