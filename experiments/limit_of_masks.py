@@ -78,8 +78,9 @@ class Cells:
         waves = np.stack([np.cos(turned), np.sin(turned)]) * size[:, None]
         self.waves = jnp.asarray(waves, jnp.float32)
         self.seen = min(1.0, float(self.setup.field) * distance / side) ** 2
-        density = tc.design.response.spectral_density(self.setup, self.frequencies)
-        weight = self.frequencies.weight * density
+        prior = self.setup.prior(self.frequencies.squared, self.setup.field)
+        weight = self.frequencies.weight * prior
+        density = self.setup.contrast**2 * prior / jnp.sum(weight)
         self.density = jnp.asarray(density, jnp.float32)
         self.weight = jnp.asarray(weight / jnp.sum(weight), jnp.float32)
 

@@ -17,6 +17,7 @@ of every mask from below; docs/theory/limit.md derives it.
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,7 +35,7 @@ from thincam_jax.design.space import DesignSpace
 Masks = Literal["shadow", "amplitude", "phase"]
 KINDS: tuple[Masks, ...] = ("shadow", "amplitude", "phase")
 _NEWTON = 60  # most steps to a response
-_TOLERANCE, _STEP = 1e-3, 1e-4  # of the logarithm of a share, and for its derivative, relative
+_TOLERANCE, _STEP = 1e-3, 1e-4  # of a search; of a share for its derivative, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +155,13 @@ class _Scene:
 
 def _equal_exposures(space: DesignSpace) -> tuple[int, float]:
     """Number of captures and the exposure of each: one that has all where they differ."""
-    given = np.asarray(space.base.exposure, float)
+    given = np.array(space.base.exposure, float)
     free = [v for v in space.variables if v.name == "exposure"]
     if not free and np.ptp(given) == 0:
         return len(given), float(given[0])
-    most = {c: v.upper for v in free for c in v.captures}
-    total = sum(most.get(c, one) for c, one in enumerate(given.tolist()))
-    return 1, float(space.limits.exposure or total)
+    for variable in free:
+        given[list(variable.captures)] = variable.upper
+    return 1, float(space.limits.exposure or np.sum(given))
 
 
 def _limit_of_shadows(scene: _Scene) -> Limit:
@@ -181,10 +182,8 @@ def _limit_of_shadows(scene: _Scene) -> Limit:
     def attained(logarithm: float) -> float:
         return filling(math.exp(logarithm)).attained
 
-    ends = math.log(most) - np.array([14.0, 2 * _STEP])
-    share = math.exp(
-        minimize_scalar(attained, bounds=ends, method="bounded", options={"xatol": _TOLERANCE}).x
-    )
+    end = math.log(most)
+    share = math.exp(_place_of_least(attained, end - 14, end - 2 * _STEP))
     best = filling(share)
     # At one price the dual is convex in the share: it lies above its chords, continued.
     step, here = _STEP * share, best.dual(best.price)
@@ -193,6 +192,11 @@ def _limit_of_shadows(scene: _Scene) -> Limit:
     error = here + min(0.0, falls * (most - share), -rises * share)
     passed = light(share) / scene.area
     return Limit(error, best.attained, scene.whole(best.ratio), passed, "shadow")
+
+
+def _place_of_least(cost: Callable[[float], float], low: float, high: float) -> float:
+    options = {"xatol": _TOLERANCE}
+    return float(minimize_scalar(cost, bounds=(low, high), method="bounded", options=options).x)  # pyright: ignore
 
 
 class _Filling:
@@ -235,7 +239,7 @@ class _Filling:
             return (used - self.budget) / (used + self.budget)
 
         about = math.log(self.scene.total / self.budget)
-        return math.exp(brentq(excess, about - 60, about + 20, xtol=1e-8))
+        return math.exp(float(brentq(excess, about - 60, about + 20, xtol=1e-8)))  # pyright: ignore
 
     @functools.cached_property
     def ratio(self) -> np.ndarray:
@@ -273,8 +277,7 @@ def _limit_by_overlap(scene: _Scene, masks: Masks) -> Limit:
     def attained(light: float) -> float:
         return scene.error(ratio(light))
 
-    ends = (1e-6 * scene.area, scene.area)
-    light = float(minimize_scalar(attained, bounds=ends, method="bounded").x)
+    light = _place_of_least(attained, 1e-6 * scene.area, scene.area)
     found = scene.whole(ratio(light))
     return Limit(scene.error(ratio(best)), attained(light), found, light / scene.area, masks)
 

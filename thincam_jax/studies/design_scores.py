@@ -387,13 +387,17 @@ class DesignScores:
         return sentences
 
     def _beside_the_limit(self) -> str:
-        words = {"shadow": "that cast shadows", "amplitude": "with diffraction"}
-        above = [
-            f"{self.found[0].reported - least:.1f} dB above the limit that no masks {words[masks]} "
-            f"pass ({self.reference.name} {self.reference.reported - least:.1f} dB)"
+        kinds = {"shadow": "that cast shadows", "amplitude": "with diffraction"}
+
+        def above(one: Candidate, least: float) -> str:
+            return f"{(math.nan if one.reported is None else one.reported) - least:.1f} dB"
+
+        words = [
+            f"{above(self.found[0], least)} above the limit that no masks {kinds[masks]} pass "
+            f"({self.reference.name} {above(self.reference, least)})"
             for masks, least in self.limits_db.items()
         ]
-        return f"{self.found[0].name} is {' and '.join(above)}."
+        return f"{self.found[0].name} is {' and '.join(words)}."
 
     def _beside_others(self) -> list[str]:
         """Random designs beside the found ones, and the gain on further photographs."""
