@@ -150,6 +150,9 @@ def test_fronts_are_written_and_reported(whole, tmp_path):
     assert "Thickness against resolution" in page
     assert f"{thick.resolution_line_pairs_per_mm:.3f}" in page
     assert whole[1].pareto is None
+    assert design.limits_db.keys() == {"shadow", "amplitude"}
+    assert all(design.found[0].reported > least for least in design.limits_db.values())
+    assert "above the limit that no masks that cast shadows pass (pairs" in page
 
 
 def test_an_objective_that_is_nan_is_refused(tmp_path, monkeypatch):
