@@ -12,7 +12,7 @@ a PSF hold T of the light that the open mask lets through, A = (Mw)². Then |H| 
 - "phase": with |t| ≤ 1 and Fresnel diffraction, |H| ≤ min(T, overlap), which a lens attains.
 
 The least error over all powers within these bounds is a convex problem. Its dual bounds the error
-of every mask from below; docs/theory/limit.md derives it.
+of every mask from below; docs/theory/index.md derives it.
 """
 
 import functools
