@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.ndimage
 from shadow_masks import ShadowJudge, drawn_mask
 
 from thincam_jax.design import (
@@ -92,3 +93,30 @@ def test_best_of_all_masks_of_sixteen_cells(light, width):
     above = limit(searched).above(best)
     print(f"\n{light}, {width} mm: {10 * np.log10(best):.2f} dB, {above:.2f} above the limit")
     assert above > 0
+
+
+@pytest.mark.parametrize("light", ["little", "plenty"])
+def test_diffraction_of_cells_as_wide_as_pixels(light):
+    """By Fresnel's transfer function, 8 samples a cell: errors, and how bright pixels are."""
+    searched, rng = problem(LIGHTS[light], count=128), np.random.default_rng(2)
+    judge, found = ShadowJudge(searched, 128), limit(searched)
+    opening, dots = np.zeros((128, 128)), rng.random((64, 64)) < 0.3
+    opening[63:66, 63:66] = 1.0
+    masks = {"opening": opening, "random cells": np.kron(dots, np.ones((2, 2)))}
+    masks["by gradient"] = (judge.descended(0.3 * rng.random((128, 128)), 120) > 0.5) * 1.0
+    magnification, step = 1 + 6.5 / 250, 5.632 / 1024
+    places = (np.arange(2048) - 1023.5) * step * magnification
+    u = np.asarray(searched.best_data.frequencies.axis) / 6.5
+    waves = np.exp(-2j * np.pi * u[:, None] * places) * np.sinc(0.044 * u)[:, None]
+    chirp = np.exp(-1j * np.pi * 5e-4 * 6.5 / magnification * np.fft.fftfreq(2048, step) ** 2)
+    for name, mask in masks.items():
+        field = np.pad(np.kron(mask, np.ones((8, 8))), 512)
+        spectrum = np.fft.fft2(field) * chirp[:, None] * chirp
+        psf = np.abs(np.fft.ifft2(spectrum)) ** 2
+        across = psf @ waves.T * (step * magnification) ** 2
+        power = [np.abs(rows @ across)[None] ** 2 for rows in (waves, waves.conj())]
+        shadow, wave = judge.error(mask[None]), judge.error(mask[None], power=power)
+        brightest = scipy.ndimage.uniform_filter(psf, 8).max()
+        above = f"{found.above(shadow):.2f}, diffracted {found.above(wave):.2f} dB above"
+        print(f"\n{light}, {name}: {above}, brightest pixel {brightest:.2f}")
+        assert wave > found.error
