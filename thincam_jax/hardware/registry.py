@@ -32,6 +32,7 @@ _BUILT_IN = {
     "stages": {
         "zaber": "thincam_jax.hardware.stages.zaber:ZaberStage",
         "grbl": "thincam_jax.hardware.stages.grbl:GrblStage",
+        "manual": "thincam_jax.hardware.stages.manual:ManualStage",
     },
     "displays": {
         "sdl": "thincam_jax.hardware.displays.sdl:SdlDisplay",

@@ -21,6 +21,8 @@ from thincam_jax.commands.terminal import (
 )
 
 if TYPE_CHECKING:
+    import rich.progress
+
     from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern
     from thincam_jax.hardware.acquisition.rig import Rig
     from thincam_jax.hardware.commands.config import CaptureConfig
@@ -78,6 +80,8 @@ def capture(
             store.parent.mkdir(parents=True, exist_ok=True)
             with opened(asked, plan) as rig, progress_bar("{task.fields[rate]}") as bar:
                 task = bar.add_task(asked.name, total=len(plan.steps), rate="")
+                if rig.stage is not None and rig.stage.by_hand:
+                    rig.on_step = _pausing(bar, plan, rig.on_step)
 
                 def told_of(made: Any) -> None:
                     nonlocal kept
@@ -99,6 +103,20 @@ def capture(
             raise KeyboardInterrupt
     made = "; ".join((f"{outcome.total} frames", *outcome.found))
     say_result("store", store, f"{store}: {made}; next: thincam run {store}")
+
+
+def _pausing(
+    bar: "rich.progress.Progress", plan: "AcquisitionPlan", on_step: Callable[[int], None]
+) -> Callable[[int], None]:
+    """`on_step` that takes the bar away before a step that asks someone to move the stage."""
+    places = [step.position for step in plan.placed()]
+
+    def paused(number: int) -> None:
+        if bar.live.is_started and places[number] != places[number - 1]:
+            bar.stop()
+        on_step(number)
+
+    return paused
 
 
 def preview(
