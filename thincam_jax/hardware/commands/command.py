@@ -249,6 +249,7 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
         ModulatorOptics,
         MonitorOptics,
         MosaicOptics,
+        StageErrors,
         WalledOptics,
     )
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
@@ -270,7 +271,10 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
             pixels: Any = study.mask
             table = virtual.phase_levels or display.phase_levels
             light += table.build(), pixels.amplitude.shape
-        parts = [ModulatorOptics(one, study.sensor, *light) for one in scenes_of(study)]
+        errors = StageErrors() if virtual.stage is None else virtual.stage.build()
+        parts = [
+            ModulatorOptics(one, study.sensor, *light, stage=errors) for one in scenes_of(study)
+        ]
         side_by_side = mosaic_of(study)
         if side_by_side is not None and side_by_side.wall is not None:
             parts = [WalledOptics(one, side_by_side) for one in parts]
@@ -317,7 +321,12 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     render = partial(pattern_levels, shape=tuple(display), **given)
     seconds = store / _SECONDS
     return Taken(
-        RigFrames(frames, camera, found.pixels, lit, darks, variance, found.settings[0].bayer),
+        RigFrames(
+            *(frames, camera, found.pixels, lit, darks, variance, found.settings[0].bayer),
+            positions=tuple(found.shots[step]["position"] for step in found.lit)
+            if config.stage is not None
+            else (),
+        ),
         [pattern.label for pattern in patterns],
         [_shown(render, pattern) for pattern in patterns if config.display.pitch],
         [one.exposure for one in found.settings],
