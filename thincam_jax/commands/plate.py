@@ -21,16 +21,14 @@ def plate(
         Path, typer.Option(help="File: .gds for lithography, .png or .tif for a grey-scale writer.")
     ],
     halftone: Annotated[
-        str | None, typer.Option(help="Open and closed cells of this side, such as 4um.")
+        str | None,
+        typer.Option(
+            help="Open and closed cells of this side, such as 4um; 4um,irradiance: their open "
+            "fraction is the irradiance in place of the amplitude."
+        ),
     ] = None,
-    density: Annotated[
-        str, typer.Option(help="Open fraction of the cells: 'amplitude' or 'irradiance'.")
-    ] = "amplitude",
     pixel: Annotated[str | None, typer.Option(help="Pixel of a grey table, such as 1um.")] = None,
     shot: Annotated[int, typer.Option(min=0, help="Exposure of the study, from 0.")] = 0,
-    images: Annotated[
-        bool, typer.Option(help="Reconstruct the first target with both plates, too.")
-    ] = True,
     set_: Overrides = None,
 ) -> None:
     """Write a study's mask for a shop.
@@ -49,8 +47,8 @@ def plate(
         if suffix not in (_LAYOUT, *_TABLES):
             raise ConfigError(f"--out {out}: give .gds, or .png or .tif for a grey table")
         if (suffix == _LAYOUT) == (pixel is not None):
-            told = "a grey table needs it, such as 1um" if pixel is None else "a layout has none"
-            raise ConfigError(f"--pixel: {told}")
+            needed = "a grey table needs it, such as 1um" if pixel is None else "a layout has none"
+            raise ConfigError(f"--pixel: {needed}")
         study = build_study(load_study(config, tuple(set_ or ()), "a plate is a study's mask"))
         if shot >= len(study.exposures):
             last = len(study.exposures) - 1
@@ -58,11 +56,12 @@ def plate(
         exposure = study.exposures[shot]
         mask: Any = exposure.mask(study.mask)
         try:
-            made = mask
+            made, least = mask, None
             if halftone is not None:
-                made = grid.halftone(mask, _length("--halftone", halftone), density)  # pyright: ignore[reportArgumentType]
+                cell, _, density = halftone.partition(",")
+                least, how = _length("--halftone", cell), density.strip() or "amplitude"
+                made = grid.halftone(mask, least, how)  # pyright: ignore[reportArgumentType]
             if suffix == _LAYOUT:
-                least = None if halftone is None else _length("--halftone", halftone)
                 write_gds(out, made, smallest_feature=least)
             else:
                 write_density_map(out, made, _length("--pixel", str(pixel)))
@@ -70,7 +69,7 @@ def plate(
             advice = "--halftone with a cell, such as 4um"
             raise ConfigError(f"{config}: {error}".replace(_IN_PYTHON, advice)) from None
         if halftone is not None:
-            _tell_losses(study, exposure, mask, made, images)
+            _say_losses(study, exposure, mask, made)
         say_result("plate", out, f"{out}: exposure {shot}, {_about(exposure)}")
 
 
@@ -89,11 +88,11 @@ def _about(exposure: Any) -> str:
     return f"{zones}{exposure.width:g} mm wide"
 
 
-def _tell_losses(study: Any, exposure: Any, mask: Any, made: Any, images: bool) -> None:
-    """What half-tone cells change: the PSF, and the image of one capture."""
+def _say_losses(study: Any, exposure: Any, mask: Any, made: Any) -> None:
+    """Say by how much cells change the PSF, and the image of one capture."""
     from thincam_jax.studies.plates import compare_plates
 
-    found = compare_plates(study, exposure, mask, made, images=images)
+    found = compare_plates(study, exposure, mask, made)
     say_result("psf_error", found.psf_error, f"PSF: {found.psf_error:.1%} from the grey plate's")
     if found.target:
         loss = found.grey_db - found.plate_db

@@ -31,11 +31,11 @@ class PlateComparison:
 
 
 def compare_plates(
-    study: Study, exposure: Exposure, mask: AbstractMask, plate: AbstractMask, *, images: bool
+    study: Study, exposure: Exposure, mask: AbstractMask, plate: AbstractMask
 ) -> PlateComparison:
     """Compare a plate with the mask of one exposure of a study.
 
-    `images`: reconstruct the first picture of the study with both, by `AdmmTV`.
+    The first picture among its targets is reconstructed with both, by `AdmmTV`.
     """
     kernels = []
     for one in (mask, plate):
@@ -45,7 +45,7 @@ def compare_plates(
         kernels.append(np.asarray(psf(camera, model=method, **given), float))
     error = float(np.linalg.norm(kernels[1] - kernels[0]) / np.linalg.norm(kernels[0]))
     seen = [target for target in study.targets if target.is_picture]
-    if not images or not seen:
+    if not seen:
         return PlateComparison(error)
     scores = []
     for name, one in (("grey", mask), ("plate", plate)):

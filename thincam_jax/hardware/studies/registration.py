@@ -87,7 +87,8 @@ def register_shots(
 ) -> ShotPlaces:
     """Places of each shot of a study, by frames (capture, y, x) of its exposures.
 
-    - `width`: width of the square object that the images cover, mm. `bayer`: as of `frame_solver`.
+    - `width`: width of the square object that the images cover, mm.
+    - `bayer`: pattern of the frames, see `frame_solver`.
 
     A place counts where it differs from the read one by more than 3 standard errors and moves the
     image's edge by more than 0.05 pixels: along the axis, down or across. Shots stand as read whose

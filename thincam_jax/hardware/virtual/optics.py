@@ -54,7 +54,7 @@ class StageErrors:
     """Differences of a stage's true places from those that it reports, but at position 0.
 
     - `axial`, `sideways`: their standard deviations along the axis, and across it along y and x.
-    - `seed`: of the errors, which are the same whenever a position is reached, to 1 µm.
+    - `seed`: seed of the errors, which are the same whenever a position is reached, to 1 µm.
     """
 
     axial: Annotated[float, quantity("mm", non_negative=True)] = 0.0
@@ -117,11 +117,14 @@ class ModulatorOptics:
         field = self.phases.field if self.phases else lambda shown, _: np.sqrt(shown / 255)
         # Only the size of this mask is used; its transmittances act in the PSF.
         mask = SampledMask(shown / 255, self.pixel_pitch)
-        along, down, across = self.stage.at(position).tolist()
+        along, *aside = self.stage.at(position).tolist()
         camera = LenslessCamera(mask, self.sensor, self.distance + position + along)
         grid, spectrum = self.sensor.grid, self.scene.spectrum
         for plane in self.scene.planes:
             shape = projected_shape(camera, plane)
+            if any(aside):  # as if its shadow fell from beside the axis
+                lever = -float(plane.distance) / float(camera.distance)
+                camera = camera.replace(place=[lever * side for side in aside])
             kernels = [
                 weight
                 * pixelated_psf(
@@ -131,7 +134,6 @@ class ModulatorOptics:
                     pixel_pitch=self.pixel_pitch,
                     fill_factor=self.fill_factor,
                     gap=0.0 if self.phases is None else self.phases.gap,
-                    moved=(down, across),
                 )
                 for wavelength, weight in spectrum.colours
             ]
@@ -215,7 +217,6 @@ def pixelated_psf(
     pixel_pitch: float,
     fill_factor: float = 1.0,
     gap: float = 0.0,
-    moved: tuple[float, float] = (0.0, 0.0),
 ) -> Float[Array, "y x"]:
     r"""Pixel averages of the PSF of a display of square pixels with given amplitudes.
 
@@ -228,8 +229,7 @@ def pixelated_psf(
     averages are one-dimensional. The remainder, such as the rounding to 8 bits, is averaged over a
     few points of each pixel; that of phases, which is more, over as many as its fringes need.
 
-    - `gap`: amplitude between the open parts, that of a slit over all pixels less these.
-    - `moved`: (y, x) of the grid's middle beside the display's, mm.
+    `gap`: amplitude between the open parts, that of a slit over all pixels less these.
     """
     dtype = grid.pitch.dtype
     mask = SampledMask(amplitude, pixel_pitch)
@@ -241,7 +241,11 @@ def pixelated_psf(
     places = np.concatenate([leggauss(nodes)[0], leggauss(points)[0]]) / 2
     offsets = grid.pitch * jnp.asarray(places, dtype)[:, None]
     slit = jnp.asarray(pixel_pitch, dtype), jnp.asarray(fill_factor, dtype)
-    x = jnp.concatenate([grid.y + moved[0] + offsets, grid.x + moved[1] + offsets], axis=1)
+    y, x = grid.y, grid.x
+    if path.place is not None:  # the shadow moves
+        aside = path.distance * path.place / path.object_distance
+        y, x = y - aside[0], x - aside[1]
+    x = jnp.concatenate([y + offsets, x + offsets], axis=1)
     if down.shape[0] == across.shape[0]:  # both at once: half as much to compile
         fields = _slit_fields(x, len(down) - 1, slit, path)
         along = fields[:, : grid.shape[0]], fields[:, grid.shape[0] :]
