@@ -40,9 +40,9 @@ def compare_plates(
     kernels = []
     for one in (mask, plate):
         camera = exposure.camera(study.sensor, study.mask).replace(mask=one)
-        given = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
-        method = PsfMethod("separable", nodes=_NODES)
-        kernels.append(np.asarray(psf(camera, model=method, **given), float))
+        light, method = exposure.wavelength, PsfMethod("separable", nodes=_NODES)
+        found = psf(camera, wavelength=light, object_distance=study.object_distance, model=method)
+        kernels.append(np.asarray(found, float))
     error = float(np.linalg.norm(kernels[1] - kernels[0]) / np.linalg.norm(kernels[0]))
     seen = [target for target in study.targets if target.is_picture]
     if not seen:

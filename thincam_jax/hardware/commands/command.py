@@ -319,13 +319,11 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     display = found.provenance.get("display_shape") or (virtual and virtual.display) or (768, 1024)
     given = {"pitch": config.display.pitch, "pictures": picture_levels(config)}
     render = partial(pattern_levels, shape=tuple(display), **given)
-    seconds = store / _SECONDS
+    seconds, places = store / _SECONDS, [found.shots[step]["position"] for step in found.lit]
     return Taken(
         RigFrames(
             *(frames, camera, found.pixels, lit, darks, variance, found.settings[0].bayer),
-            positions=tuple(found.shots[step]["position"] for step in found.lit)
-            if config.stage is not None
-            else (),
+            positions=tuple(place for place in places if place is not None),
         ),
         [pattern.label for pattern in patterns],
         [_shown(render, pattern) for pattern in patterns if config.display.pitch],

@@ -197,7 +197,9 @@ class _CaptureRun(Run):
         """
         config, positions = self.config, self.taken.seen.positions
         study = build_study(config, shape)
-        if not positions or config.optics is None or config.plan.kind == "scene":
+        exposures = study.methods[0].exposures
+        single = len(positions) == len(exposures) and exposures.layout is None
+        if not single or config.optics is None:  # several frames of an exposure, or all in one
             return study
         phases = study.methods[0].phases
         read = read_distances(config.optics.distance, positions, phases)

@@ -141,19 +141,23 @@ def _place(study: Study, first: Exposure, shot: Exposure, image, reference) -> S
 
 def _alone(method: Method, taken: slice, number: int) -> Method:
     """The method of one shot, by a Wiener filter."""
-    name = f"{method.name}, shot {number}"
-    return replace(
-        method, name=name, exposures=_of_rows(tuple(method.exposures)[taken]), solver=Wiener()
+    rows = tuple(method.exposures)[taken]
+    alone = _of_rows(rows, [one.distance for one in rows])
+    return replace(method, name=f"{method.name}, shot {number}", exposures=alone, solver=Wiener())
+
+
+def _of_rows(
+    rows: Sequence[Exposure], distance: list[float], centre: list[tuple[float, float]] | None = None
+) -> Exposures:
+    return Exposures(
+        [one.beta for one in rows],
+        distance,
+        phase=[one.phase for one in rows],
+        wavelength=[one.wavelength for one in rows],
+        width=[one.width for one in rows],
+        profile=[one.profile for one in rows],
+        centre=centre,
     )
-
-
-def _of_rows(rows: Sequence[Exposure], **changed: object) -> Exposures:
-    given = {
-        name: [getattr(one, name) for one in rows]
-        for name in ("beta", "distance", "phase", "wavelength", "width", "profile")
-    }
-    beta, distance = given.pop("beta"), changed.pop("distance", given.pop("distance"))
-    return Exposures(beta, distance, **given, **changed)
 
 
 def standing_at(study: Study, places: ShotPlaces) -> Study:
@@ -161,9 +165,8 @@ def standing_at(study: Study, places: ShotPlaces) -> Study:
     methods = []
     for method in study.methods:
         each = [place for place in places.shots for _ in range(method.phases)]
-        moved = {"distance": [one.distance for one in each], "centre": [one.centre for one in each]}
-        rows = tuple(method.exposures)
-        methods.append(replace(method, exposures=_of_rows(rows, **moved)))
+        moved = [one.distance for one in each], [one.centre for one in each]
+        methods.append(replace(method, exposures=_of_rows(tuple(method.exposures), *moved)))
     return replace(study, methods=tuple(methods))
 
 
