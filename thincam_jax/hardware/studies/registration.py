@@ -165,7 +165,8 @@ def standing_at(study: Study, places: ShotPlaces) -> Study:
     methods = []
     for method in study.methods:
         each = [place for place in places.shots for _ in range(method.phases)]
-        moved = [one.distance for one in each], [one.centre for one in each]
+        centres = [one.centre for one in each]
+        moved = [one.distance for one in each], centres if np.any(centres) else None
         methods.append(replace(method, exposures=_of_rows(tuple(method.exposures), *moved)))
     return replace(study, methods=tuple(methods))
 
