@@ -1,4 +1,4 @@
-"""Draws the errors of docs/theory/extremes.md: `python docs/draw_extremes.py`."""
+"""Draws the errors of docs/measured/extremes.md: `python docs/draw_extremes.py`."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, PICTURE = ROOT / "docs/theory/extremes.md", ROOT / "docs/images/extremes.png"
+PAGE, PICTURE = ROOT / "docs/measured/extremes.md", ROOT / "docs/images/extremes.png"
 NAMED = ("the thesis' camera", "focus", "d = 1 mm, pixel average")
 
 values = PAGE.read_text("utf-8").partition("## Gradients")[0]

@@ -236,6 +236,41 @@ def masks():
     return figure
 
 
+def bench():
+    """The bench of configs/rig_manual.yaml from the side, whole and near the sensor, to scale."""
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    whole, near = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    mask, sensor, object_, polarisers = 3.168 / 2, 224 * 0.0165 / 2, 40.0, (-4.0, 2.0)
+    for ax in (whole, near):
+        ax.plot([-250, -250], [-object_, object_], color="k", lw=4)
+        for z in polarisers:
+            ax.plot([z, z], [-4, 4], color="0.55", lw=3, ls=(0, (1, 1)))
+        ax.plot([0, 0], [-mask, mask], color="k", lw=3, ls=(0, (2, 1)))
+        ax.plot([6.5, 6.5], [-sensor, sensor], color="k", lw=5)
+        ax.axhline(0, color="0.7", lw=0.8, ls="-.")
+        for edge in (-1, 1):
+            ax.plot([-250, 6.5], [0, edge * mask * 256.5 / 250], color="0.75", lw=0.8)
+        ax.set(xlabel="z (mm), along the light", ylabel="x (mm)")
+    whole.set(xlim=(-262, 30), ylim=(-62, 62), aspect="equal", title="the whole bench")
+    whole.text(-243, 30, "object, 80 mm wide", va="center")
+    whole.annotate(
+        "modulator, polarisers, sensor", (0, 5), (-120, 46), arrowprops={"arrowstyle": "-"}
+    )
+    near.set(xlim=(-8, 14), ylim=(-7.5, 7.5), aspect="equal", title="mask and sensor")
+    for z, x, text in (
+        (polarisers[0], 4.6, "polariser"),
+        (0.0, -2.6, "mask"),
+        (polarisers[1], 4.6, "polariser"),
+        (6.5, 2.6, "sensor"),
+    ):
+        near.text(z, x, text, ha="center", va="center", fontsize=9)
+    near.annotate("", (6.5, -5.6), (0, -5.6), arrowprops={"arrowstyle": "<->"})
+    near.text(3.25, -6.5, "d = 6.5 mm", ha="center", va="center", fontsize=9)
+    near.annotate("", (11.5, -2.6), (6.7, -2.6), arrowprops={"arrowstyle": "->"})
+    near.text(9.3, -3.6, "stage", ha="center", va="center", fontsize=9)
+    return figure
+
+
 def photon_transfer():
     """A frame of an evenly lit sensor, corrected, and the line: the example of its page."""
     page = (ROOT / "docs/measured/photon_transfer.md").read_text("utf-8")
@@ -270,7 +305,7 @@ def photon_transfer():
 
 
 _DESIGNS = (design_landscape, design_front, suggest, screen_design)
-_DRAWN = (models, calibration, *_DESIGNS, depth, sweep, masks, which_mask, photon_transfer)
+_DRAWN = (models, calibration, *_DESIGNS, depth, sweep, masks, which_mask, bench, photon_transfer)
 PAGES = {f.__name__: f for f in _DRAWN}
 
 for name in sys.argv[1:] or PAGES:

@@ -1,6 +1,6 @@
 """The extremes of the PSF models: which cameras, how exact, and an independent reference.
 
-Every bound is some two to three times what was measured; `docs/theory/extremes.md` quotes the list.
+Bounds are some two to three times what was measured; `docs/measured/extremes.md` quotes them.
 """
 
 import dataclasses

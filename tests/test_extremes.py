@@ -420,7 +420,7 @@ def test_reference_against_quadrature(order, name, x):
 
 def documented(first: str) -> dict[str, list[str]]:
     """The rows of the table that begins with that cell, by their own first cell."""
-    page = (ROOT / "docs/theory/extremes.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/measured/extremes.md").read_text(encoding="utf-8")
     table = page[page.index(f"| {first} |") :].split("\n\n")[0].splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert len({len(row) for row in rows}) == 1

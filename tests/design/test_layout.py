@@ -11,6 +11,7 @@ import pytest
 import thincam_jax as tc
 from helpers import quick
 from thincam_jax._core.files import MeasurementError
+from thincam_jax.design.grey_files import write_density_map
 from thincam_jax.design.relief_files import read_height_map, write_height_map, write_stl
 from thincam_jax.imaging.refractive_index import CauchyIndex, bk7
 from thincam_jax.lensless.masks import random_cells
@@ -255,3 +256,31 @@ def test_a_mosaic_is_one_layout(tmp_path):
     dark = read(tc.design.write_gds(tmp_path / "dark.gds", mosaic, tone="opaque"))
     assert (region & dark).area() < 1e-4 * dark.area()
     assert (region + dark).area() * 1e-12 == pytest.approx(1.1 * 0.4, rel=1e-4)
+
+
+def test_a_density_map_is_the_light_that_passes(tmp_path):
+    mask = tc.FresnelZoneAperture(100.0, 0.4, width=0.6, height=0.48, centre=CENTRE)
+    for name in ("plate.png", "plate.tif"):
+        path = write_density_map(tmp_path / name, mask, 6 * um)
+        with PIL.Image.open(path) as image:
+            counts = np.asarray(image)
+        record = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        assert counts.shape == tuple(record["shape"]) == (80, 100) and record["pixel_mm"] == 6 * um
+        y, x = np.meshgrid(
+            *((np.arange(n) - (n - 1) / 2) * 6 * um for n in (80, 100)), indexing="ij"
+        )
+        light = ((1 + np.cos(100.0 * (x**2 + y**2) + 0.4)) / 2) ** 2
+        np.testing.assert_allclose(counts * record["transmittance_per_count"], light, atol=1e-5)
+    densities = np.interp([0.1 * 65535], record["counts"], 10 ** -np.array(record["densities"]))
+    np.testing.assert_allclose(densities, 0.1, atol=1e-4)
+    for given, error, message in (
+        (("plate.bmp", mask, 6 * um), ValueError, "written as .png or .tif"),
+        (("plate.png", mask, 7 * um), ValueError, "not a whole number"),
+        (("plate.png", phase_mask(), 6 * um), TypeError, "no density; write it by write_height"),
+    ):
+        with pytest.raises(error, match=message):
+            write_density_map(tmp_path / given[0], *given[1:])
+
+
+def phase_mask():
+    return tc.lensless.masks.phase.PhaseMask(np.full((8, 9), 1e-3), 10 * um, bk7())

@@ -2,7 +2,7 @@
 
 Each pattern carries a fiducial, its number in base 256 in the first pixels; the camera sees what is
 shown with a texture of its own, so that a frame tells of which pattern it is, whole. It imports no
-JAX: `python memory_rig.py STORE FRAMES [rows|stays|pictures|scene]` is the process that tests kill.
+JAX: `python memory_rig.py STORE FRAMES [rows|stays|pictures|scene|manual]` is what tests kill.
 """
 
 import itertools
@@ -28,6 +28,7 @@ from thincam_jax.hardware.base import (
     Timeout,
 )
 from thincam_jax.hardware.plans import pictures, scene
+from thincam_jax.hardware.stages.manual import ManualStage
 from thincam_jax.hardware.virtual.devices import Faults
 
 SHAPE = (6, 9)  # of sensor and display
@@ -59,13 +60,17 @@ class World:
         self.opened[role] += 1
         return kind(self)
 
-    def rig(self, stage=True):
+    def rig(self, stage=True, manual=False):
+        by_hand = lambda: ManualStage(ManualStage.Options(highest=50.0), self.move)  # noqa: E731
         return Rig(
             lambda: self.open(MemoryCamera),
             lambda: self.open(MemoryDisplay),
             self.render,
-            (lambda: self.open(MemoryStage)) if stage else None,
+            by_hand if manual else (lambda: self.open(MemoryStage)) if stage else None,
         )
+
+    def move(self, position):
+        self.position = position
 
     def render(self, pattern: Pattern) -> np.ndarray:
         levels = np.zeros(self.shape, np.uint8)
@@ -278,7 +283,7 @@ if __name__ == "__main__":
     }  # fmt: skip
     for kind in kinds.keys() & set(sys.argv):
         plan = kinds[kind]()
-    with World(pause=0.004).rig() as rig:
+    with World(pause=0.004).rig(manual="manual" in sys.argv) as rig:
         done = acquire(plan, rig, sys.argv[1])
     assert not xla_bridge.backends_are_initialized()  # the rig leaves the GPU to others
     print("complete" if done.complete else "stopped")

@@ -139,7 +139,7 @@ def test_points(name, dtype):
 
 def test_documented():
     """The page's table has every row, and behind each measured error the bound held here."""
-    page = (ROOT / "docs/theory/extremes.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/measured/extremes.md").read_text(encoding="utf-8")
     table = page[page.index("| rays |") :].split("\n\n")[0].splitlines()[2:]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert [row[0] for row in rows] == list(EXTREMES)

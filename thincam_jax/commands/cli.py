@@ -16,6 +16,7 @@ from typer.core import TyperCommand, TyperGroup
 from thincam_jax._core.program_cache import cache_state, keep_programs
 from thincam_jax.commands import terminal
 from thincam_jax.commands.kinds import commands_of_rooms, has_room, init, load_experiment
+from thincam_jax.commands.plate import plate
 from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
 from thincam_jax.commands.run import design, explain, explore, run, schema
 from thincam_jax.commands.sweep.command import sweep
@@ -23,7 +24,7 @@ from thincam_jax.commands.terminal import reported, say, say_result
 
 ORDER = (
     *("init", "explain", "explore", "run", "preview", "capture", "examine", "reconstruct"),
-    *("calibrate", "sweep", "design", "train", "schema", "doctor"),
+    *("calibrate", "sweep", "design", "plate", "train", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -130,6 +131,11 @@ for group, command, *examples in (
         'sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
     ),
     (app, design, "design design.yaml", "design design.yaml --out found"),
+    (
+        *(app, plate),
+        "plate study.yaml --out plate.gds --halftone 4um",
+        "plate study.yaml --out plate.tif --pixel 1um --shot 2",
+    ),
     (app, examine, "examine RAW.tif --psf PSF.tif", "examine CAPTURES/*.tif --json"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
     *((app, *one) for one in commands_of_rooms()),

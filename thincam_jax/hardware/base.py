@@ -7,7 +7,7 @@ streams and releases the device. A driver raises `HardwareError` and nothing els
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -235,10 +235,12 @@ def grab(camera: Camera, timeout: float) -> Frame:
 class Stage(Device):
     """A linear stage with `limits`, its lowest and highest position in mm.
 
-    It has to be homed once before it moves (`NotHomed`).
+    It has to be homed once before it moves (`NotHomed`). `by_hand`: a person moves it, and stops
+    near the position asked for; the one that is read counts.
     """
 
     limits: tuple[float, float]
+    by_hand: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -263,6 +265,10 @@ class Stage(Device):
     @abstractmethod
     def stop(self) -> None:
         """Stop at once; the position stays known."""
+
+    def recall(self, readings: Mapping[float, float]) -> None:
+        """Positions reached before an interruption, mm, by those asked for; one by hand offers
+        them again."""
 
 
 class Display(Device):

@@ -106,6 +106,8 @@ class Preview:
         if len(plan.patterns) > 1:
             most = float(len(plan.patterns) - 1)
             controls.append(Control("pattern", "pattern", "", 0.0, most, 0.0))
+        if rig.stage is not None and rig.stage.by_hand:
+            rig.stage = None  # its person moves it unasked
         if rig.stage is not None:
             low, high = rig.stage.limits
             place = min(max(rig.stage.position(), low), high)

@@ -28,10 +28,12 @@ _BUILT_IN = {
         "pylon": "thincam_jax.hardware.cameras.pylon:PylonCamera",
         "aravis": "thincam_jax.hardware.cameras.aravis:AravisCamera",
         "pylablib": "thincam_jax.hardware.cameras.pylablib:PylablibCamera",
+        "picamera2": "thincam_jax.hardware.cameras.picamera2:RaspberryPiCamera",
     },
     "stages": {
         "zaber": "thincam_jax.hardware.stages.zaber:ZaberStage",
         "grbl": "thincam_jax.hardware.stages.grbl:GrblStage",
+        "manual": "thincam_jax.hardware.stages.manual:ManualStage",
     },
     "displays": {
         "sdl": "thincam_jax.hardware.displays.sdl:SdlDisplay",

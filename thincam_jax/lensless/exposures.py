@@ -103,16 +103,20 @@ class Exposure:
     profile: Profile | None = None
     moves: tuple[Plain, Plain] | None = None
     part: MosaicPart | None = None
+    centre: tuple[Plain, Plain] | None = None
 
     def mask(self, mask: AbstractMask | None = None) -> AbstractMask:
         """A zone plate with the numbers of this exposure and all others as of `mask`, whose own
-        profile holds where the exposure has none. A mask of another family is returned as it is."""
+        profile holds where the exposure has none. A mask of another family keeps its own, but for
+        the centre."""
+        if mask is not None and not isinstance(mask, FresnelZoneAperture):
+            return mask if self.centre is None else mask.replace(centre=self.centre)
         numbers: dict[str, Any] = {"beta": self.beta, "phase": self.phase, "width": self.width}
+        if self.centre is not None:
+            numbers["centre"] = self.centre
         if self.profile is not None:
             numbers["profile"] = self.profile
-        if mask is None:
-            return FresnelZoneAperture(**numbers)
-        return mask.replace(**numbers) if isinstance(mask, FresnelZoneAperture) else mask
+        return FresnelZoneAperture(**numbers) if mask is None else mask.replace(**numbers)
 
     def sensor(self, sensor: Sensor) -> Sensor:
         """The sensor exposed `relative_time` times as long."""
@@ -146,6 +150,7 @@ class Exposures(Module):
     - `take`: number of the exposure among those with the same settings, each with noise of its own;
       by default they are counted.
     - `moves`: x of the object's middle at the beginning and the end of each, mm; see `ImagePlane`.
+    - `centre`: (y, x) of the mask's middle of each, mm, where it is not that of the mask given.
     - `layout`: masks side by side, which take all at once; None for one after another.
 
     Plain numbers are kept with all their digits, arrays of JAX as they are: gradients pass through
@@ -172,6 +177,7 @@ class Exposures(Module):
     width: Each = eqx.field(converter=unchecked("mm"))
     relative_time: Each = eqx.field(converter=unchecked("a ratio"))
     moves: Float[Array, "exposure 2"] | Float[np.ndarray, "exposure 2"] | None
+    centre: Float[Array, "exposure 2"] | Float[np.ndarray, "exposure 2"] | None
     take: tuple[int, ...] = eqx.field(static=True)
     profile: tuple[Profile | None, ...] = eqx.field(static=True)
     layout: Layout | None = eqx.field(static=True)
@@ -188,6 +194,7 @@ class Exposures(Module):
         profile: Profile | None | Sequence[Profile | None] = None,
         take: Sequence[int] | None = None,
         moves: Numbers | Sequence[Sequence[float]] | None = None,
+        centre: Numbers | Sequence[Sequence[float]] | None = None,
         layout: Layout | None = None,
     ):
         given = {"beta": beta, "phase": phase, "distance": distance, "wavelength": wavelength}
@@ -208,7 +215,8 @@ class Exposures(Module):
             spread = jnp if isinstance(value, Array) else np
             setattr(self, name, spread.broadcast_to(value, (count,)))
         self.profile = tuple(profiles * count if len(profiles) == 1 else profiles)  # pyright: ignore
-        self.moves = None if moves is None else _moves(moves, count)
+        self.moves = None if moves is None else _pairs("moves", moves, count)
+        self.centre = None if centre is None else _pairs("centre", centre, count)
         self.layout = layout
         if layout is not None:
             _check_layout(layout, count, numbers["relative_time"])
@@ -233,7 +241,10 @@ class Exposures(Module):
         return dataclasses.replace(one, part=MosaicPart(number, every, self.layout))
 
     def _alone(self, number: int, read: Any) -> Exposure:
-        ends = None if self.moves is None else self.moves[number]
+        ends, centre = (
+            None if pairs is None else (read(pairs[number][0]), read(pairs[number][1]))
+            for pairs in (self.moves, self.centre)
+        )
         return Exposure(
             read(self.beta[number]),
             read(self.phase[number]),
@@ -243,7 +254,8 @@ class Exposures(Module):
             read(self.relative_time[number]),
             self.take[number],
             self.profile[number],
-            None if ends is None else (read(ends[0]), read(ends[1])),
+            ends,
+            centre=centre,
         )
 
     def cameras(self, sensor: Sensor, mask: AbstractMask | None = None) -> list[LenslessCamera]:
@@ -273,6 +285,7 @@ class Exposures(Module):
             profile=[one for one in self.profile for _ in phases],
             take=[one for one in self.take for _ in phases],
             moves=None if self.moves is None else repeated(self.moves),
+            centre=None if self.centre is None else repeated(self.centre),
         )
 
     def fringe_scanned(self) -> "Exposures":
@@ -336,9 +349,9 @@ def _numbers(name: str, given: Any) -> Array | np.ndarray:
     return checked if of_jax else array.astype(float)
 
 
-def _moves(given: Any, count: int) -> Array | np.ndarray:
+def _pairs(name: str, given: Any, count: int) -> Array | np.ndarray:
     array = given if isinstance(given, Array) else np.asarray(given, float)
-    checks.finite("moves", array, "mm", shape=(count, 2))
+    checks.finite(name, array, "mm", shape=(count, 2))
     return array
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import scipy.io
-from jaxtyping import UInt16
+from jaxtyping import UInt8, UInt16
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
@@ -127,8 +127,17 @@ def unpack_raw(
     groups, stride = -(-columns // group), len(data) // rows
     if len(data) % rows or not 0 <= stride - groups * (group + 1) < 256:
         raise MeasurementError(f"{path}: {len(data)} bytes are no {rows}×{columns} of {bits} bit")
-    packed = data.reshape(rows, stride)[:, : groups * (group + 1)].reshape(rows, groups, group + 1)
+    return unpacked(data.reshape(rows, stride), columns, bits)
+
+
+def unpacked(
+    rows: UInt8[np.ndarray, "y stride"], columns: int, bits: int
+) -> UInt16[np.ndarray, "y x"]:
+    """Counts of packed rows of 10 or 12 bit, without the bytes that pad them; see `unpack_raw`."""
+    group = 4 if bits == 10 else 2
+    groups = -(-columns // group)
+    packed = rows[:, : groups * (group + 1)].reshape(len(rows), groups, group + 1)
     low, shifts = packed[..., -1:].astype(np.uint16), (bits - 8) * np.arange(group, dtype=np.uint16)
     high = packed[..., :-1].astype(np.uint16) << (bits - 8)
     counts = high | (low >> shifts) & (2**bits // 256 - 1)
-    return counts.reshape(rows, -1)[:, :columns]
+    return counts.reshape(len(rows), -1)[:, :columns]

@@ -98,6 +98,8 @@ def acquire(
             recorder.note(
                 {"begins": now(), "versions": versions(), "procedure": asdict(run.procedure)}
             )
+            if rig.stage is not None:
+                rig.stage.recall(_readings(run, recorder))
             done, started = total - len(todo), time.monotonic()
             for count, number in enumerate(todo, 1):
                 if stop.is_set():
@@ -164,6 +166,12 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     layout = whole, dtype_of_bits(bits), attributes
     create_store(path, run.plan.as_json(), *layout, together=together)
     return settings
+
+
+def _readings(run: Taker, recorder: Recorder) -> dict[float, float]:
+    """Positions that the stage reached for the frames taken, by those asked for, mm."""
+    places = {run.steps[step].position: one["position"] for step, one in recorder.taken.items()}
+    return {asked: float(found) for asked, found in places.items() if asked is not None}
 
 
 def _require_stage(run: Taker, positions: list[float]) -> None:

@@ -184,15 +184,16 @@ def now() -> str:
 class Recorder(AbstractContextManager["Recorder"]):
     """Writer of a store's frames in the order of its steps; a context manager.
 
-    `missing` are the steps not yet taken. Leaving the context writes the frames still queued.
+    `missing` are the steps not yet taken, `taken` the records of the others by step. Leaving the
+    context writes the frames still queued.
     """
 
     def __init__(self, path: Path):
         self.store = CaptureStore(path, "r+")
         self._journal = Journal(path / JOURNAL)
         digests = np.zeros_like(self.store.digests)
-        taken = frame_records(path / JOURNAL, self._journal.records, len(digests))
-        for step, record in taken.items():
+        self.taken = frame_records(path / JOURNAL, self._journal.records, len(digests))
+        for step, record in self.taken.items():
             digests[step] = int(record["digest"], 16)
         digests[sorted(self.store.lost())] = 0
         self._digests = digests

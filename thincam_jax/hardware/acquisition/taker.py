@@ -112,7 +112,7 @@ class Procedure:
     - `retries`: repetitions of a step after IncompleteFrame, Timeout and Disconnected.
     - `reopen_wait`: s before a disconnected device is reopened.
     - `saturated`: largest allowed share of saturated pixels.
-    - `position_tolerance`: mm between the commanded position and the one reached.
+    - `position_tolerance`: mm between the commanded position and the one reached, of a motor.
     - `exposure`: "given" with the plan, or found before the first frame, "auto": the first
       settings' by the search `auto_exposure`; the others keep their ratio to it.
     """
@@ -262,7 +262,7 @@ class Taker:
         with self.clock("move"):
             if step.position is not None and step.position != self._asked:
                 reached, self._position = stage.move_to(step.position), stage.position()
-                for place in (reached, self._position):
+                for place in () if stage.by_hand else (reached, self._position):
                     if abs(place - step.position) > self.procedure.position_tolerance:
                         raise NotHomed(
                             self.name("stage"), f"move to {step.position:g} mm",

@@ -21,6 +21,8 @@ from thincam_jax.commands.terminal import (
 )
 
 if TYPE_CHECKING:
+    import rich.progress
+
     from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, Pattern
     from thincam_jax.hardware.acquisition.rig import Rig
     from thincam_jax.hardware.commands.config import CaptureConfig
@@ -78,6 +80,8 @@ def capture(
             store.parent.mkdir(parents=True, exist_ok=True)
             with opened(asked, plan) as rig, progress_bar("{task.fields[rate]}") as bar:
                 task = bar.add_task(asked.name, total=len(plan.steps), rate="")
+                if rig.stage is not None and rig.stage.by_hand:
+                    rig.on_step = _pausing(bar, plan, rig.on_step)
 
                 def told_of(made: Any) -> None:
                     nonlocal kept
@@ -99,6 +103,20 @@ def capture(
             raise KeyboardInterrupt
     made = "; ".join((f"{outcome.total} frames", *outcome.found))
     say_result("store", store, f"{store}: {made}; next: thincam run {store}")
+
+
+def _pausing(
+    bar: "rich.progress.Progress", plan: "AcquisitionPlan", on_step: Callable[[int], None]
+) -> Callable[[int], None]:
+    """`on_step` that takes the bar away before a step that asks someone to move the stage."""
+    places = [step.position for step in plan.placed()]
+
+    def paused(number: int) -> None:
+        if bar.live.is_started and places[number] != places[number - 1]:
+            bar.stop()
+        on_step(number)
+
+    return paused
 
 
 def preview(
@@ -231,6 +249,7 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
         ModulatorOptics,
         MonitorOptics,
         MosaicOptics,
+        StageErrors,
         WalledOptics,
     )
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
@@ -252,7 +271,10 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
             pixels: Any = study.mask
             table = virtual.phase_levels or display.phase_levels
             light += table.build(), pixels.amplitude.shape
-        parts = [ModulatorOptics(one, study.sensor, *light) for one in scenes_of(study)]
+        errors = StageErrors() if virtual.stage is None else virtual.stage.build()
+        parts = [
+            ModulatorOptics(one, study.sensor, *light, stage=errors) for one in scenes_of(study)
+        ]
         side_by_side = mosaic_of(study)
         if side_by_side is not None and side_by_side.wall is not None:
             parts = [WalledOptics(one, side_by_side) for one in parts]
@@ -297,9 +319,12 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     display = found.provenance.get("display_shape") or (virtual and virtual.display) or (768, 1024)
     given = {"pitch": config.display.pitch, "pictures": picture_levels(config)}
     render = partial(pattern_levels, shape=tuple(display), **given)
-    seconds = store / _SECONDS
+    seconds, places = store / _SECONDS, [found.shots[step]["position"] for step in found.lit]
     return Taken(
-        RigFrames(frames, camera, found.pixels, lit, darks, variance, found.settings[0].bayer),
+        RigFrames(
+            *(frames, camera, found.pixels, lit, darks, variance, found.settings[0].bayer),
+            positions=tuple(place for place in places if place is not None),
+        ),
         [pattern.label for pattern in patterns],
         [_shown(render, pattern) for pattern in patterns if config.display.pitch],
         [one.exposure for one in found.settings],

@@ -25,7 +25,7 @@ from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.cameras.features import BIT_DEPTHS
 from thincam_jax.hardware.displays.levels import PhaseLevels
-from thincam_jax.hardware.virtual.optics import MonitorPose
+from thincam_jax.hardware.virtual.optics import MonitorPose, StageErrors
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -104,10 +104,19 @@ class OpticsConfig(Section):
 
 
 class ReconstructionConfig(Section):
-    """Reconstruction of the image; as of a study's methods."""
+    """Reconstruction of the image; as of a study's methods.
+
+    - `registration`: whether images of the single shots tell where the sensor stood; by default
+      those of a manual stage do.
+    """
 
     kind: MethodKind = "wiener"
     variation: VariationConfig | None = None
+    registration: bool | None = None
+
+
+class StageErrorsConfig(section(StageErrors)):
+    """Errors of the stage's positions, but at 0."""
 
 
 class MonitorConfig(section(MonitorPose)):
@@ -124,7 +133,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
     - `electrons`: per second, of a pixel from each mm² of open aperture before a white scene; with
       a screen, of the brightest pixel before a white monitor.
     - `screen`: a see-through camera before a monitor, for a Hadamard plan.
-    - `monitor`: its true pose before a lensless camera.
+    - `monitor`: its true pose before a lensless camera. `stage`: errors of the stage's positions.
     - `phase_levels`: true levels of a phase modulator; default those of the display.
     """
 
@@ -133,6 +142,7 @@ class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"respo
     electrons: Annotated[float, Field(gt=0)]
     screen: SeeThroughConfig | None = None
     monitor: MonitorConfig = MonitorConfig()
+    stage: StageErrorsConfig | None = None
     phase_levels: PhaseTable | None = None
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from thincam_jax._core.quantity import FieldError
 from thincam_jax._core.table import Table
 from thincam_jax._core.text import slug
 from thincam_jax.commands.config_file import ConfigError
@@ -19,6 +20,13 @@ from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.hardware import plot
 from thincam_jax.hardware.commands.config import CaptureConfig
 from thincam_jax.hardware.studies.images import frame_solver
+from thincam_jax.hardware.studies.registration import (
+    ShotPlace,
+    ShotPlaces,
+    read_distances,
+    register_shots,
+    standing_at,
+)
 from thincam_jax.hardware.studies.rig import (
     FrameAgreement,
     MatrixAgreement,
@@ -41,6 +49,10 @@ from thincam_jax.studies.study import Method, Study, Synthesis, Target
 _MATRIX = (
     "The matrix is in matrix.zarr, to be given as `matrix` of a file that captures pictures or a "
     "scene; in Python it is read by `thincam_jax.measured.calibration.read_matrix`."
+)
+_PLACES = (
+    "Distance of mask and sensor, and the mask's middle beside the sensor's, by the images of the "
+    "single shots. The first shot is taken to stand where it reads."
 )
 
 
@@ -81,6 +93,7 @@ class _CaptureRun(Run):
         self.agreement: FrameAgreement | MatrixAgreement | None = None
         self.found = f"{len(taken.labels)} frames, at most {taken.seen.frames.max():.0f} counts."
         self.table: Table | None = None  # of pictures
+        self.places: ShotPlaces | None = None  # as registered
         self.metrics |= {
             "study": config.name,
             "kind": config.kind,
@@ -103,6 +116,8 @@ class _CaptureRun(Run):
         if self.agreement is not None:
             self.metrics["agreement"] = asdict(self.agreement)
             self.found = str(self.agreement)
+        if self.places is not None:
+            self.found = f"{self.found} {str(self.places).capitalize()}"
         self.complete(self.page())
 
     def page(self) -> Page:
@@ -126,6 +141,8 @@ class _CaptureRun(Run):
         explained = "Differences over the noise's standard deviation: 1 is agreement within it."
         compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
         parts = [compared] if rows else []
+        if self.places is not None:
+            parts += [Part("Registration of the shots", (self.places.table(), _PLACES))]
         parts += [Part("Beside what was published", (table, PUBLISHED))] if table else []
         if taken.seconds:
             parts += [
@@ -149,12 +166,20 @@ class _CaptureRun(Run):
 
     def reconstruct(self) -> None:
         seen, config = self.taken.seen, self.config
-        study = build_study(config, (seen.frames.shape[1], seen.frames.shape[2]))
-        solve = frame_solver(study, study.config.object.width, seen.variance, seen.bayer)
+        study = self.study((seen.frames.shape[1], seen.frames.shape[2]))
+        width, places = study.config.object.width, None
+        by_hand = config.stage is not None and config.stage.driver == "manual"
+        wanted = by_hand if (given := config.reconstruction.registration) is None else given
+        if wanted and len(study.methods[0].shots) > 1 and config.plan.mosaic is None:
+            places = register_shots(study, seen.frames, width, seen.bayer)
+            study = standing_at(study, places)
+            self.places, self.metrics["registration"] = places, asdict(places)["shots"]
+        solve = frame_solver(study, width, seen.variance, seen.bayer)
         captured = solve(seen.frames)
         images, scores = {"captured": as_picture(np.asarray(captured.image, float))}, {}
         if seen.camera is not None and config.virtual is not None:
-            whole = build_study(config, config.virtual.sensor)
+            whole = self.study(config.virtual.sensor)
+            whole = whole if places is None else standing_at(whole, places)
             found = compare_frames(whole, seen, solve, captured, config.seed)
             images, scores, self.agreement = found.images, found.psnr_db, found.agreement
             self.metrics["psnr_db"] = scores
@@ -164,6 +189,26 @@ class _CaptureRun(Run):
             self.folder.save_image(name.replace(" ", "-"), plot.stretched(image))
         self.metrics["status"] = captured.status
         self.metrics["object_pixel_mm"] = pitch
+
+    def study(self, shape: tuple[int, int]) -> Study:
+        """The study of frames of a shape, its shots where the stage read.
+
+        **Errors**: ConfigError for two shots of one mask at one place.
+        """
+        config, positions = self.config, self.taken.seen.positions
+        study = build_study(config, shape)
+        exposures = study.methods[0].exposures
+        single = len(positions) == len(exposures) and exposures.layout is None
+        if not single or config.optics is None:  # several frames of an exposure, or all in one
+            return study
+        phases = study.methods[0].phases
+        read = read_distances(config.optics.distance, positions, phases)
+        shots = tuple(ShotPlace(one, one, status="as read") for one in read)
+        try:
+            return standing_at(study, ShotPlaces(shots))
+        except FieldError as error:
+            listed = ", ".join(f"{one:g}" for one in read)
+            raise ConfigError(f"{config.name}: shots at {listed} mm: {error}") from None
 
     def look(self) -> None:
         """The pictures or the scene, by the matrix of a calibration."""

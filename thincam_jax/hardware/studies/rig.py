@@ -79,6 +79,7 @@ class RigFrames:
     - `lit`: pixels of that part that see light.
     - `variance`: variance of frames that are means of several; infinite for unknown pixels.
     - `bayer`: pattern of the frames; None of grey ones.
+    - `positions`: the stage's, mm, for each frame; empty without a stage.
     """
 
     frames: Float[np.ndarray, "capture y x"]
@@ -88,6 +89,7 @@ class RigFrames:
     dark_frames: int = 0
     variance: Float[np.ndarray, "y x"] | None = None
     bayer: Pattern | None = None
+    positions: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from thincam_jax.hardware.base import (
 )
 from thincam_jax.hardware.cameras.features import BIT_DEPTHS
 from thincam_jax.hardware.displays.levels import GreyLevelDisplay, GreyLevels
+from thincam_jax.hardware.stages.manual import ManualStage
 from thincam_jax.hardware.virtual.rig import VirtualRig
 
 Fault = Literal[
@@ -234,9 +235,11 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         )
 
     def stage(self, driver: str, options: Mapping[str, Any] | None = None) -> Stage:
-        """Open the stage by zaber or grbl; `options` except its port."""
+        """Open the stage by zaber or grbl, `options` except its port; manual asks a person."""
+        if driver == "manual":
+            return ManualStage(ManualStage.Options(**(options or {})), self.rig.on_move)
         if driver not in ("zaber", "grbl"):
-            raise _none_virtual("stages", driver, "zaber or grbl")
+            raise _none_virtual("stages", driver, "zaber, grbl or manual")
         if _lacks_library("stages", driver):
             self._there.setdefault("stage", PlainStage(self.rig.on_move))
             return self._there["stage"]

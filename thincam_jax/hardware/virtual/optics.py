@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from thincam_jax._core.grids import Grid, block_mean, centred_indices
 from thincam_jax._core.precision import as_complex, product
-from thincam_jax._core.quantity import check_fields, quantity
+from thincam_jax._core.quantity import check_fields, quantity, whole
 from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse
 from thincam_jax.imaging.operators.base import dtype_of
@@ -49,6 +49,29 @@ class Optics(Protocol):
     ) -> Float[np.ndarray, "y x"]: ...
 
 
+@dataclass(frozen=True)
+class StageErrors:
+    """Differences of a stage's true places from those that it reports, but at position 0.
+
+    - `axial`, `sideways`: their standard deviations along the axis, and across it along y and x.
+    - `seed`: seed of the errors, which are the same whenever a position is reached, to 1 µm.
+    """
+
+    axial: Annotated[float, quantity("mm", non_negative=True)] = 0.0
+    sideways: Annotated[float, quantity("mm", non_negative=True)] = 0.0
+    seed: Annotated[int, whole(0, 2**32 - 1)] = 0
+
+    def __post_init__(self):
+        check_fields(self)
+
+    def at(self, position: float) -> Float[np.ndarray, "3"]:
+        """Errors (z, y, x) at a position, mm."""
+        place = round(1000 * position)
+        random = np.random.default_rng([self.seed, place + 2**31])
+        scale = np.array([self.axial, self.sideways, self.sideways])
+        return (place != 0) * scale * random.standard_normal(3)
+
+
 @dataclass(frozen=True, eq=False)
 class ModulatorOptics:
     """A scene through a light modulator, whose pixels are the mask, on a sensor on a stage.
@@ -63,6 +86,7 @@ class ModulatorOptics:
     - `fill_factor`: open fraction of a modulator pixel's area.
     - `phases`: phases of a phase modulator's levels, and its dead space.
     - `aperture`: rows and columns in the middle of a phase modulator that are lit; None: all.
+    - `stage`: errors of the stage that carries the sensor.
     """
 
     scene: Scene
@@ -73,6 +97,7 @@ class ModulatorOptics:
     fill_factor: float = 1.0
     phases: PhaseLevels | None = None
     aperture: tuple[int, int] | None = None
+    stage: StageErrors = StageErrors()
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
@@ -92,10 +117,14 @@ class ModulatorOptics:
         field = self.phases.field if self.phases else lambda shown, _: np.sqrt(shown / 255)
         # Only the size of this mask is used; its transmittances act in the PSF.
         mask = SampledMask(shown / 255, self.pixel_pitch)
-        camera = LenslessCamera(mask, self.sensor, self.distance + position)
+        along, *aside = self.stage.at(position).tolist()
+        camera = LenslessCamera(mask, self.sensor, self.distance + position + along)
         grid, spectrum = self.sensor.grid, self.scene.spectrum
         for plane in self.scene.planes:
             shape = projected_shape(camera, plane)
+            if any(aside):  # as if its shadow fell from beside the axis
+                lever = -float(plane.distance) / float(camera.distance)
+                camera = camera.replace(place=[lever * side for side in aside])
             kernels = [
                 weight
                 * pixelated_psf(
@@ -212,7 +241,11 @@ def pixelated_psf(
     places = np.concatenate([leggauss(nodes)[0], leggauss(points)[0]]) / 2
     offsets = grid.pitch * jnp.asarray(places, dtype)[:, None]
     slit = jnp.asarray(pixel_pitch, dtype), jnp.asarray(fill_factor, dtype)
-    x = jnp.concatenate([grid.y + offsets, grid.x + offsets], axis=1)
+    y, x = grid.y, grid.x
+    if path.place is not None:  # the shadow moves
+        aside = path.distance * path.place / path.object_distance
+        y, x = y - aside[0], x - aside[1]
+    x = jnp.concatenate([y + offsets, x + offsets], axis=1)
     if down.shape[0] == across.shape[0]:  # both at once: half as much to compile
         fields = _slit_fields(x, len(down) - 1, slit, path)
         along = fields[:, : grid.shape[0]], fields[:, grid.shape[0] :]
