@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from thincam_jax._core.program_cache import cache_state, keep_programs
 from thincam_jax.commands import terminal
+from thincam_jax.commands.evaluate.command import evaluate, info
 from thincam_jax.commands.kinds import commands_of_rooms, has_room, init, load_experiment
 from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
 from thincam_jax.commands.run import design, explain, explore, run, schema
@@ -23,7 +24,7 @@ from thincam_jax.commands.terminal import reported, say, say_result
 
 ORDER = (
     *("init", "explain", "explore", "run", "preview", "capture", "examine", "reconstruct"),
-    *("calibrate", "sweep", "design", "train", "schema", "doctor"),
+    *("calibrate", "dataset", "evaluate", "sweep", "design", "train", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -36,6 +37,7 @@ GROUPS = {
     ),
     "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
     "Image": ("field", "flip", "linear", "gamma", "white_balance"),
+    "Comparison": ("truth", "truth_area", "fit", "shift", "published"),
 }
 
 
@@ -113,6 +115,8 @@ app = typer.Typer(
 # The callback keeps the name of a single command.
 calibrate = typer.Typer(no_args_is_help=True, help="Check a calibration by captures.")
 calibrate.callback()(lambda: None)
+dataset = typer.Typer(no_args_is_help=True, help="Look at a data set of captures and truths.")
+dataset.callback()(lambda: None)
 for group, command, *examples in (
     (app, init, "init study", "init design --sensor 1500x2000 --pitch 3.45um --out mine.yaml"),
     (app, schema, "schema study > study.schema.json"),
@@ -129,16 +133,22 @@ for group, command, *examples in (
         "sweep study.yaml --grid seed=0:4:5",
         'sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
     ),
+    (
+        *(app, evaluate, "evaluate DATASET --method admm-tv --method ridge --limit 100"),
+        "evaluate DATASET --split test --fit maximum --truth linear --out runs/comparison",
+    ),
+    (dataset, info, "dataset info DATASET"),
     (app, design, "design design.yaml", "design design.yaml --out found"),
     (app, examine, "examine RAW.tif --psf PSF.tif", "examine CAPTURES/*.tif --json"),
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
     *((app, *one) for one in commands_of_rooms()),
 ):
-    layout = Grouped if command in (reconstruct, check) else Once
+    layout = Grouped if command in (reconstruct, check, evaluate) else Once
     printing = command if command is schema else with_output(command)  # a schema is JSON
     told_last = "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in examples)])
     group.command(cls=layout, epilog=told_last)(printing)
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(dataset, name="dataset")
 
 
 def _print_version(asked: bool) -> bool:
