@@ -9,7 +9,7 @@ import pytest
 
 from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare
 from thincam_jax.measured.layouts import open_pairs, with_psf
-from thincam_jax.measured.pairs import Alignment, as_light, relative_pitch
+from thincam_jax.measured.pairs import TruthAlignment, as_light, relative_pitch
 
 SHAPE = (12, 20)
 
@@ -248,10 +248,10 @@ class TestMatched:
         picture = np.zeros((1, 12, 20), np.float32)
         halves = truth.reshape(1, 8, 2, 12, 2).mean(axis=(2, 4))
         picture[:, 2:10, 4:16] = halves
-        image, seen = Alignment((4, 20), (8, 32)).matched(picture, truth, log)
+        image, seen = TruthAlignment((4, 20), (8, 32)).matched(picture, truth, log)
         np.testing.assert_allclose(image, seen, rtol=1e-6)
         # Turned: the same picture lies turned in the camera's image.
-        turned = Alignment((4, 20), (8, 32), turned=True)
+        turned = TruthAlignment((4, 20), (8, 32), turned=True)
         np.testing.assert_allclose(turned.matched(picture[:, ::-1, ::-1], truth, log)[0], halves)
 
     def test_remainders_of_blocks(self):
@@ -261,20 +261,20 @@ class TestMatched:
         top, left = log.first_pixel
         kept = truth[:, top : top + 24, left : left + 39]
         picture = kept.reshape(1, 8, 3, 13, 3).mean(axis=(2, 4))
-        image, seen = Alignment().matched(picture, truth, log)
+        image, seen = TruthAlignment().matched(picture, truth, log)
         np.testing.assert_allclose(image, seen, rtol=1e-6)
 
     def test_upright_and_grey(self):
         log = self.prepared((12, 20)).log
         truth = np.random.default_rng(1).uniform(size=(3, 12, 20)).astype(np.float32)
-        image, seen = Alignment(upside_down=True).matched(truth[:1], truth, log)
+        image, seen = TruthAlignment(upside_down=True).matched(truth[:1], truth, log)
         np.testing.assert_array_equal(image, truth[:1, ::-1])
         np.testing.assert_allclose(seen, truth.mean(0, keepdims=True)[:, ::-1])
 
     def test_outside(self):
         log = self.prepared((12, 20)).log
         with pytest.raises(MeasurementError, match="30:40, of which the capture has none"):
-            Alignment((30, 40), (0, 9)).matched(
+            TruthAlignment((30, 40), (0, 9)).matched(
                 np.zeros((1, 12, 20), np.float32), np.zeros((1, 5, 5), np.float32), log
             )
 

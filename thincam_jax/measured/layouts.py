@@ -18,7 +18,7 @@ import yaml
 
 from thincam_jax._core.files import file_digest, read_regular
 from thincam_jax._core.text import shortened
-from thincam_jax.measured.pairs import Alignment, Pairs, Stored
+from thincam_jax.measured.pairs import Pairs, Stored, TruthAlignment
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError
 from thincam_jax.measured.read import SUFFIXES, image_files, read_image, read_photograph
 
@@ -37,14 +37,14 @@ _KNOWN = (
     "which may lie in a folder for each split"
 )
 _SOURCE = "LenslessPiCam dcb4aba, lensless/utils/dataset.py"
-_DIGICAM = Alignment((80, 280), (100, 366), turned=True, source=_SOURCE)
-_MULTILENS = Alignment((118, 241), (220, 343), source=_SOURCE)
-_UPSIDE_DOWN = Alignment(upside_down=True, source=_SOURCE)
+_DIGICAM = TruthAlignment((80, 280), (100, 366), turned=True, source=_SOURCE)
+_MULTILENS = TruthAlignment((118, 241), (220, 343), source=_SOURCE)
+_UPSIDE_DOWN = TruthAlignment(upside_down=True, source=_SOURCE)
 # By the name of the repository, which is that of a folder.
-PUBLISHED: Mapping[str, Alignment] = {
+PUBLISHED: Mapping[str, TruthAlignment] = {
     "DiffuserCam-Lensless-Mirflickr-Dataset": _UPSIDE_DOWN,
     "DiffuserCam-Lensless-Mirflickr-Dataset-NORM": _UPSIDE_DOWN,
-    "TapeCam-Mirflickr-25K": Alignment((45, 295), (95, 428), source=_SOURCE),
+    "TapeCam-Mirflickr-25K": TruthAlignment((45, 295), (95, 428), source=_SOURCE),
     **{
         f"DigiCam-Mirflickr-{masks}-{n}K": _DIGICAM
         for masks in ("SingleMask", "MultiMask")
@@ -174,7 +174,7 @@ def _diffusercam(path: Path, split: str | None) -> Pairs | None:
         storage=_files(files, reversed_colours=True),
         split=split,
         splits=splits or {"all": len(files)},
-        alignment=Alignment(upside_down=True, source=source),
+        alignment=TruthAlignment(upside_down=True, source=source),
         encoding="linear",
         psf_channels="mean",
         notes=notes,
@@ -245,7 +245,7 @@ LAYOUTS: tuple[Callable[[Path, str | None], Pairs | None], ...] = (
 
 
 def _content(path: Path) -> str:
-    """What is there, for a message."""
+    """Entries of a folder, for a message."""
     if path.is_file():
         return "is a file, no data set"
     entries = sorted(path.iterdir())

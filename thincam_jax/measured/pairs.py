@@ -32,7 +32,7 @@ Span = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Alignment:
+class TruthAlignment:
     """Part of a camera's image that the truth shows, and how both lie.
 
     - `rows`, `columns`: the first one and the one after the last, in pixels of the capture, of the
@@ -109,7 +109,7 @@ def _resized(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What is stored of a pair. `ambient`: a capture without the scene; `label`: of its mask."""
+    """Stored images of a pair. `ambient`: capture without the scene; `label`: number of a mask."""
 
     name: str
     capture: Raw
@@ -129,10 +129,10 @@ class Storage(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class PairedCapture:
     """A capture and what it shows.
 
-    - `truth`: (channel, y, x), light, 1 at full scale; its pixels are its own (see `Alignment`).
+    - `truth`: (channel, y, x), light, 1 at full scale, on pixels of its own: see `TruthAlignment`.
     - `psf`: that of the mask that took the capture. `background`: an ambient capture, or None.
     - `mask_label`: number of the mask, of a camera that has several.
     """
@@ -149,13 +149,13 @@ class Pair:
 class Pairs:
     """Captures and truths of a data set's split, read when they are asked for: `pairs[3]`.
 
-    - `layout`, `path`, `split`: what the files are, and `splits`, those that there are.
+    - `layout`, `path`, `split`: kind and place of the files; `splits`: number of pairs of each.
     - `psfs`: file of the PSF by the label of its mask; of one mask by None. May be empty.
-    - `alignment`: see there. `encoding`: of the truths; None: integers of 8 bit are sRGB, deeper
-      ones and floats are linear in light.
-    - `psf_channels`: as published: one PSF for each colour, or their "mean".
-    - `bits`: of the camera; None: those of the files. `licence`: as the files state it.
-    - `notes`: what a user should know, in sentences.
+    - `alignment`: see `TruthAlignment`. `encoding`: encoding of truths; None: integers of 8 bit are
+      sRGB, deeper ones and floats are linear in light.
+    - `psf_channels`: published use of the PSF: one for each colour, or their "mean".
+    - `bits`: bit depth of the camera; None: that of the files. `licence`: words of the files.
+    - `notes`: facts that a user should know, in sentences.
 
     ```python
     import numpy as np
@@ -180,7 +180,7 @@ class Pairs:
     split: str = "all"
     splits: Mapping[str, int] = dataclasses.field(default_factory=dict)
     psfs: Mapping[int | None, Path] = dataclasses.field(default_factory=dict)
-    alignment: Alignment = Alignment()
+    alignment: TruthAlignment = TruthAlignment()
     encoding: Encoding | None = None
     psf_channels: Literal["each", "mean"] = "each"
     bits: int | None = None
@@ -194,7 +194,7 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.storage.names)
 
-    def __getitem__(self, number: int) -> Pair:
+    def __getitem__(self, number: int) -> PairedCapture:
         """A pair; MeasurementError, one line, for files that cannot be read."""
         if not 0 <= number < len(self):
             raise IndexError(f"pair {number} of {len(self)}")
@@ -202,7 +202,7 @@ class Pairs:
         path = self.psf_file(one.label)
         psf = None if path is None else _psf(path)
         light = as_light(one.truth, self.encoding)
-        return Pair(one.name, one.capture, light, psf, one.ambient, one.label)
+        return PairedCapture(one.name, one.capture, light, psf, one.ambient, one.label)
 
     def psf_file(self, label: int | None = None) -> Path | None:
         """The PSF's file of a mask; None where there is none."""
@@ -212,7 +212,7 @@ class Pairs:
         """SHA-256 of all that is stored of a pair."""
         return self.storage.digest(number)
 
-    def batches(self, size: int, *, ahead: int = 2) -> Iterator[list[Pair]]:
+    def batches(self, size: int, *, ahead: int = 2) -> Iterator[list[PairedCapture]]:
         """All pairs in order, `size` together, the last of them fewer.
 
         - `ahead`: batches that threads read while the one at hand is worked on.

@@ -32,7 +32,7 @@ class Agreement:
     """Scores of an image, and the image (channel, y, x) as it was compared, with its truth.
 
     - `psnr_db`: None of equal images. `ssim`: None of images smaller than its window.
-    - `gain`, `offset`: of each channel; `shift`: pixels down and to the right.
+    - `gain`, `offset`: numbers fitted to each channel; `shift`: move in pixels, down and right.
     """
 
     psnr_db: float | None
@@ -148,7 +148,7 @@ def mean_of(values: Sequence[float | None]) -> Mean | None:
 
 
 @dataclass(frozen=True)
-class MethodScores:
+class MethodSummary:
     """Scores of a method over the images of a data set.
 
     - `beside`: PSNR less that of the first method in the same images. `seconds`: median.
@@ -170,11 +170,11 @@ class MethodScores:
 
 def summarised(
     rows: Sequence[Mapping[str, Any]], failed: Mapping[str, int]
-) -> tuple[MethodScores, ...]:
+) -> tuple[MethodSummary, ...]:
     """Scores of each method of a table's rows, in order; `failed`: images of methods without."""
     methods = list(dict.fromkeys([row["method"] for row in rows] + list(failed)))
     by_method = {m: {r["number"]: r for r in rows if r["method"] == m} for m in methods}
-    found: list[MethodScores] = []
+    found: list[MethodSummary] = []
     for method, own in by_method.items():
         first = by_method[methods[0]]
         psnrs = [row["psnr_db"] for row in own.values() if row["psnr_db"] is not None]
@@ -188,11 +188,11 @@ def summarised(
         beside = None if method == methods[0] else mean_of(gains)
         counts = len(own), failed.get(method, 0)
         scores = mean_of(psnrs), beside, worst, median, best, similar, left, seconds
-        found.append(MethodScores(method, *counts, *scores))
+        found.append(MethodSummary(method, *counts, *scores))
     return tuple(found)
 
 
-def scores_table(scores: Sequence[MethodScores], brief: bool = False) -> Table:
+def scores_table(scores: Sequence[MethodSummary], brief: bool = False) -> Table:
     """The scores of methods, one a row; a `brief` table fits a terminal."""
     columns: dict[str, tuple[int, list[Cell]]] = {
         "method": (0, [one.method.replace("_", "-") for one in scores]),

@@ -145,7 +145,12 @@ def evaluate(
         from thincam_jax._core.text import slug
         from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.evaluate.config import EvaluationConfig
-        from thincam_jax.commands.evaluate.run import EvaluationFolder, run_evaluation, tasks_of
+        from thincam_jax.commands.evaluate.run import (
+            EvaluationFolder,
+            Work,
+            run_evaluation,
+            tasks_of,
+        )
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.measured import Preparation
         from thincam_jax.measured.layouts import open_pairs
@@ -205,8 +210,8 @@ def evaluate(
                 bar.update(task, completed=ended, failed=f"{failed} failed" if failed else "")
                 bar.start()
 
-            asked = {"scheduler": scheduler, "workers": workers, "published": published}
-            evaluated = run_evaluation(config, tasks, folder, progress, **asked)
+            work = Work(scheduler, workers, published)
+            evaluated = run_evaluation(config, tasks, folder, progress, work)
     show(scores_table(evaluated.scores, brief=True))
     say_result("report", folder.path / "report.html")
     if evaluated.failures:

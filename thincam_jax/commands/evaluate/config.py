@@ -1,4 +1,4 @@
-"""What an evaluation is made of, but for its methods and how many pairs: these may grow."""
+"""Options of an evaluation but for its methods and the number of pairs, which may grow."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -8,7 +8,7 @@ from thincam_jax.commands.reconstruct.options import PSF_METHODS, Recipe, Source
 from thincam_jax.commands.schema import Section
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.measured.layouts import open_pairs, with_psf
-from thincam_jax.measured.pairs import Alignment, Encoding, Pairs
+from thincam_jax.measured.pairs import Encoding, Pairs, TruthAlignment
 from thincam_jax.studies.agreement import Fit
 
 # Options of solvers, and the methods that use them.
@@ -55,7 +55,7 @@ class EvaluationConfig(Section):
             changes["encoding"] = self.truth
         if self.rows is not None or self.flip:
             was = pairs.alignment
-            changes["alignment"] = Alignment(
+            changes["alignment"] = TruthAlignment(
                 self.rows or was.rows,
                 self.columns or was.columns,
                 turned=was.turned != self.flip,

@@ -47,11 +47,11 @@ def whole_page(
     failed = [f"{name}: {reason}" for name, reason in list(found.failures.items())[:_MOST]]
     if more := len(found.failures) - len(failed):
         failed.append(f"and {more} more")
-    told = (published, "Protocols differ from ours and from each other.") if published else ()
+    others = (published, "Protocols differ from ours and from each other.") if published else ()
     parts = (
         *pictures,
         Part("How images and truths are compared", (Sentences(lines),), "Comparison"),
-        Part("Published figures", told),
+        Part("Published figures", others),
         Part("Failed", (Sentences(failed),) if failed else ()),
         Part("Data set", (facts_table(pairs),)),
     )
@@ -82,7 +82,7 @@ def pictures(
 
 
 def _png(light: np.ndarray, own_white: bool) -> bytes:
-    """From 0 to 1 in sRGB; a capture to its own white."""
+    """PNG of light from 0 to 1, in sRGB; that of a capture ends at its own white."""
     light = light[:3] if len(light) > 2 else light[:1]
     codes = np.round(255 * encode_srgb(np.clip(light, 0, 1))).astype(np.uint8)
     codes = eight_bit(light) if own_white else codes
@@ -90,7 +90,7 @@ def _png(light: np.ndarray, own_white: bool) -> bytes:
 
 
 def facts_table(pairs: Pairs) -> Table:
-    """What is known of a data set, and its first pair."""
+    """Facts about a data set, and its first pair."""
     pair = pairs[0]
     raw, (channels, rows, columns) = pair.capture, pair.truth.shape
     bits = "floats" if raw.bits is None else f"{raw.bits} bit"

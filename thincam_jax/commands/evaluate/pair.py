@@ -19,7 +19,7 @@ from thincam_jax.commands.sweep.point import one_line
 from thincam_jax.measured import MeasurementError, Raw
 from thincam_jax.measured.examination import examine
 from thincam_jax.measured.merging import without_hot_pixels
-from thincam_jax.measured.pairs import Pair, Pairs, relative_pitch
+from thincam_jax.measured.pairs import PairedCapture, Pairs, relative_pitch
 from thincam_jax.studies.agreement import Agreement, agreement
 from thincam_jax.studies.prepared import check_channels, pixel_noise, reconstruct_prepared
 
@@ -32,7 +32,7 @@ class Scored:
     """Scores of a pair by a method; or why there are none, in one line.
 
     - `key`: digest of all that they depend on.
-    - `scores`: numbers by name. `seconds`: of the reconstruction.
+    - `scores`: numbers by name. `seconds`: time of the reconstruction.
     - `shown`: capture, image and truth (channel, y, x), where they were asked for.
     """
 
@@ -69,7 +69,9 @@ def score_pair(
     return Scored(key, scores, seconds, shown=images)
 
 
-def reconstructed(config: str, method: str, pair: Pair) -> tuple[Agreement, float, float, str]:
+def reconstructed(
+    config: str, method: str, pair: PairedCapture
+) -> tuple[Agreement, float, float, str]:
     """Agreement, seconds, relative residual and status, by the steps of `thincam reconstruct`."""
     asked, pairs = opened(config)
     recipe, rig = asked.recipe(method), _rig(config, pair.mask_label, *_ratio(pair))
@@ -106,7 +108,7 @@ def opened(config: str) -> tuple[EvaluationConfig, Pairs]:
 
 @functools.lru_cache(2)
 def _shared_origin(config: str) -> list[Any]:
-    """What all pairs depend on: options, package, PSFs and further files."""
+    """Origin that all pairs share: options, package, PSFs and further files."""
     asked, pairs = opened(config)
     named = (asked.background, asked.psf_background, asked.dead)
     files = [*pairs.psfs.values(), *(Path(file) for file in named if file)]
@@ -128,5 +130,5 @@ def _rig(config: str, label: int | None, psf_scale: float | None) -> Inputs:
     return Inputs(asked.sources(psf, psf_scale))
 
 
-def _ratio(pair: Pair) -> tuple[float | None]:
+def _ratio(pair: PairedCapture) -> tuple[float | None]:
     return (None if pair.psf is None else relative_pitch(pair.psf, pair.capture),)

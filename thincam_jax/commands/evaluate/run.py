@@ -21,7 +21,7 @@ from thincam_jax.commands.run_folder import RunFolder, digest, read_entries, to_
 from thincam_jax.commands.sweep.run import Progress, tried_twice
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 from thincam_jax.measured.pairs import Pairs
-from thincam_jax.studies.agreement import MethodScores, summarised
+from thincam_jax.studies.agreement import MethodSummary, summarised
 
 _SUM = "sha256"
 _COLUMNS = (
@@ -59,14 +59,14 @@ class EvaluationFolder(RunFolder):
         self.write(f"pairs/{name}.json", to_json({**held, _SUM: digest(to_json(held))}))
 
     def held(self, name: str) -> dict[str, Any]:
-        """What was kept of a pair; nothing where there is none, or it is damaged."""
+        """Entries kept of a pair; none where its file is missing or damaged."""
         found = read_entries(self.path / "pairs" / f"{name}.json")
         return found if found.pop(_SUM, None) == digest(to_json(found)) else {}
 
 
 @dataclass(frozen=True)
-class Task:
-    """A pair and a method. `file`: of its scores in the folder."""
+class PairTask:
+    """A pair and a method. `file`: name of its scores in the folder."""
 
     method: str
     number: int
@@ -81,25 +81,34 @@ class Task:
 class Evaluated:
     """End of an evaluation: scores of each method, and why others have none."""
 
-    scores: tuple[MethodScores, ...]
+    scores: tuple[MethodSummary, ...]
     failures: dict[str, str]
 
 
-def tasks_of(pairs: Pairs, methods: Sequence[str], limit: int | None) -> list[Task]:
+@dataclass(frozen=True)
+class Work:
+    """Workers of an evaluation, and a file of published figures for its page.
+
+    - `scheduler`: address of a dask scheduler; None: `workers` local processes.
+    """
+
+    scheduler: str | None = None
+    workers: int | None = None
+    published: Path | None = None
+
+
+def tasks_of(pairs: Pairs, methods: Sequence[str], limit: int | None) -> list[PairTask]:
     """Every method for each of the first `limit` pairs."""
     names = enumerate(list(pairs.names)[:limit])
-    return [Task(method, number, name) for number, name in names for method in methods]
+    return [PairTask(method, number, name) for number, name in names for method in methods]
 
 
 def run_evaluation(
     config: EvaluationConfig,
-    tasks: Sequence[Task],
+    tasks: Sequence[PairTask],
     folder: EvaluationFolder,
     progress: Progress,
-    *,
-    published: Path | None = None,
-    scheduler: str | None = None,
-    workers: int | None = None,
+    work: Work = Work(),
 ) -> Evaluated:
     """Score every pair that the folder, which must have been claimed, does not hold; write all.
 
@@ -110,13 +119,13 @@ def run_evaluation(
     **Errors**: ConfigError where the scheduler cannot be reached or goes away.
     """
     text, double, began = config.model_dump_json(), is_double(), time.time()
-    beside = page.read_published(published)  # before any work
+    beside = page.read_published(work.published)  # before all else
     todo = [task for task in tasks if not _is_done(folder, text, task, double)]
     done, failed = len(tasks) - len(todo), 0
     progress(done, failed)
-    local = scheduler is None
-    work = local_workers(workers, len(tasks)) if local else scheduled_workers(scheduler)
-    with work as outcomes:
+    address = work.scheduler
+    local = local_workers(work.workers, len(tasks)) if address is None else None
+    with local or scheduled_workers(address or "") as outcomes:
         for task, scored in _scored(outcomes, text, todo, double):
             done, failed = done + 1, failed + (scored.reason is not None)
             folder.keep(task.file, scored)
@@ -145,15 +154,15 @@ def run_evaluation(
     return found
 
 
-def _is_done(folder: EvaluationFolder, config: str, task: Task, double: bool) -> bool:
+def _is_done(folder: EvaluationFolder, config: str, task: PairTask, double: bool) -> bool:
     """Whether the folder has its scores, of the same files and options. Failures are tried anew."""
     held = folder.held(task.file)
     return "scores" in held and held["key"] == key_of(config, task.method, task.number, double)
 
 
 def _scored(
-    outcomes: Outcomes, config: str, tasks: Sequence[Task], double: bool, images: bool = False
-) -> Iterator[tuple[Task, Scored]]:
+    outcomes: Outcomes, config: str, tasks: Sequence[PairTask], double: bool, images: bool = False
+) -> Iterator[tuple[PairTask, Scored]]:
     """Tasks in the order in which they end; a worker that dies is a score that failed."""
     named = {task.file: task for task in tasks}
     arguments = {n: (config, t.method, t.number, double, images) for n, t in named.items()}
@@ -163,8 +172,8 @@ def _scored(
 
 
 def _collect(
-    folder: EvaluationFolder, tasks: Sequence[Task]
-) -> tuple[list[dict[str, Any]], dict[Task, str]]:
+    folder: EvaluationFolder, tasks: Sequence[PairTask]
+) -> tuple[list[dict[str, Any]], dict[PairTask, str]]:
     rows, failures = [], {}
     for task in tasks:
         held = folder.held(task.file)
