@@ -15,7 +15,7 @@ import pytest
 import tifffile
 from measured.test_containers import WRITERS, packed
 from measured.test_examination import cells, counts, diffuser, quality, scene, seen, spots, zones
-from measured.test_facts import dng
+from raw_files import dng
 from skimage.data import chelsea
 from typer.testing import CliRunner
 

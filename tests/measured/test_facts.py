@@ -1,6 +1,5 @@
 """What a raw file says of its sensor is used, and contradictions are refused."""
 
-import io
 import logging
 
 import numpy as np
@@ -9,43 +8,13 @@ import PIL.TiffImagePlugin
 import pytest
 import rawpy
 import tifffile
+from raw_files import BLACK, COLOURS, RNG, SHAPE, WHITE, dng
 
 from thincam_jax.commands.reconstruct.options import Sources
 from thincam_jax.commands.reconstruct.run import Inputs
 from thincam_jax.imaging.encoding import ORIENTATION, upright
 from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare, read, read_image
-from thincam_jax.measured.bayer import colour_sites, mosaic
-
-SHAPE, BLACK, WHITE = (36, 52), 256, 4095
-RNG = np.random.default_rng(0)
-COLOURS = RNG.uniform(100, 3000, (3, *SHAPE)) * np.array([1.0, 0.7, 0.3])[:, None, None]
-
-
-def dng(pattern, orientation=1, black=BLACK, light=COLOURS, white=WHITE, more=(), sites=()):
-    """A DNG 1.4 whose pixels lie as its orientation says; several levels `black` are in `light`."""
-    inverse = {6: 8, 8: 6}.get(orientation, orientation)
-    level = black if isinstance(black, int) else 0
-    pixels = upright(np.rint(mosaic(np.asarray(light), pattern)).astype(np.uint16) + level, inverse)
-    letters = np.select(list(colour_sites(SHAPE, pattern).values()), list("RGB"), "")
-    bayer = ["RGB".index(letter) for letter in upright(letters, inverse)[:2, :2].ravel()]
-    sites, side = sites or bayer, 6 if sites else 2
-    identity = [part for value in np.eye(3, dtype=int).ravel() for part in (int(value), 1)]
-    tags = [
-        (50706, 1, 4, (1, 4, 0, 0), True),
-        (50708, 2, 0, "Test camera", True),
-        (33421, 3, 2, (side, side), True),
-        (33422, 1, side**2, tuple(sites), True),
-        (50721, 10, 9, identity, True),
-        (50714, 4, np.size(black), black, True),
-        (50717, 4, 1, white, True),
-        (50728, 5, 3, (1,) * 6, True),
-        (50778, 3, 1, 21, True),
-        (ORIENTATION, 3, 1, orientation, True),
-        *more,
-    ]
-    stream = io.BytesIO()
-    tifffile.imwrite(stream, np.ascontiguousarray(pixels), photometric=32803, extratags=tags)
-    return stream.getvalue()
+from thincam_jax.measured.bayer import mosaic
 
 
 @pytest.mark.parametrize("suffix", ["dng", "tif"])

@@ -1,10 +1,13 @@
 """Simulated recordings, the names of solvers, and changes of one number."""
 
 import numpy as np
+import PIL.Image
 import pytest
 import skimage.data
+from raw_files import SRGB, dng
 
 import thincam_jax as tc
+from thincam_jax.imaging.targets import resize
 from thincam_jax.units import deg, nm, um
 
 SENSOR = tc.Sensor((40, 52), 60 * um)
@@ -106,8 +109,11 @@ MURA = tc.LenslessCamera(tc.ModifiedUniformlyRedundantArray(11, 120 * um), SENSO
 COLOURS = np.stack([PICTURE, PICTURE[::-1], PICTURE[:, ::-1]])
 MOVED = tc.ImagePlane(PICTURE, 250.0, 120.0, moves=(0.0, 4.0))
 WHITE = tc.Spectrum([480 * nm, 540 * nm, 600 * nm])
+LEFT = np.where(np.arange(32) < 16, PICTURE, 0.0)
+PLANES = [tc.ImagePlane(PICTURE - LEFT, 300.0, 120.0), tc.ImagePlane(LEFT, 40.0, 16.0)]
 KINDS = {
     "colours": (ZONES[0], tc.Scene(tc.ImagePlane(COLOURS, 250.0, 120.0), 550 * nm)),
+    "two planes": (ZONES, tc.Scene(PLANES, 550 * nm)),
     "four phases": (FOUR, scene()),
     "MURA": (MURA, scene()),
     "own mask": (CAMERA, scene()),
@@ -121,8 +127,27 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_three_lines_of_each_kind_give_an_image_of_the_scene(kind):
     camera, seen = KINDS[kind]
-    recording = tc.record(camera, seen, noise=40.0)
-    result = tc.reconstruct(recording)
+    assert_images(camera, seen)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["a.dng", "a.jpg"])
+def test_three_lines_of_a_raw_file_and_of_12_megapixels(tmp_path, name):
+    path, size = tmp_path / name, (3000, 4000) if name == "a.jpg" else (300, 400)
+    light = resize(skimage.data.astronaut() / 255.0, size)
+    if name == "a.jpg":
+        PIL.Image.fromarray(np.round(255 * light).astype(np.uint8)).save(path)
+    else:
+        path.write_bytes(dng("GBRG", 6, light=np.moveaxis(3800 * light, -1, 0), matrix=SRGB))
+    assert_images(ZONES[0], tc.Scene.photograph(path, distance=250.0, width=120.0))
+
+
+def assert_images(camera, seen):
+    result = tc.reconstruct(tc.record(camera, seen, noise=40.0))
     assert result._repr_png_().startswith(b"\x89PNG")
-    truth = seen.planes[0].sample(tc.Grid(result.image.shape[-2:], result.pitch), magnification=1.0)
-    assert np.corrcoef(np.ravel(result.image), np.ravel(truth))[0, 1] > 0.75
+    image, pitches = np.asarray(result.image), np.ravel(result.pitch)
+    planes = sorted(seen.planes, key=lambda plane: float(plane.distance))
+    for number, (plane, pitch) in enumerate(zip(planes, pitches, strict=True)):
+        truth = plane.sample(tc.Grid(image.shape[-2:], pitch), magnification=1.0)
+        one = image[number] if len(planes) > 1 else image
+        assert np.corrcoef(np.ravel(one), np.ravel(truth))[0, 1] > 0.75

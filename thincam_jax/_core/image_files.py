@@ -10,6 +10,7 @@ import math
 import os
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ _STARTS = {
     **{b"MATLAB 5": "mat", b"MATLAB 7": "mat73", b"SIMPLE  ": "fits"},
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "tiff"),  # +: of more than 4 GB
 }
+# Raw files of cameras, most of which are TIFF with previews of their own.
+RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
 # Largest ratio of pixel bytes to file bytes: LZW, the densest usual compression, reaches some 2500
 # for a black image. Anything beyond is a decompression bomb.
 _DENSEST = 4000
@@ -48,7 +51,10 @@ class ImageFileError(ValueError):
 
 
 def kind_of(path: str | os.PathLike[str]) -> str | None:
-    """Kind of an image by its first bytes; "" of a file that ends within these, None of others."""
+    """Kind of an image by its first bytes, "raw" by its name too.
+
+    "" of a file that ends within these bytes, None of others.
+    """
     with open_regular(path) as (file, _):
         return kind_of_start(file.read(8))
 
@@ -57,6 +63,8 @@ def kind_of_start(start: bytes) -> str | None:
     """`kind_of` by the first 8 bytes."""
     if any(one.startswith(start) and one != start for one in _STARTS):
         return ""
+    if Path(path).suffix.lower() in RAW_SUFFIXES:
+        return "raw"
     return next((kind for one, kind in _STARTS.items() if start.startswith(one)), None)
 
 
@@ -92,6 +100,17 @@ def whole_of(file: Any, size: int, kind: str | None) -> bytes:
     data = file.read(size)
     _CHECKS.get(kind, len)(data)
     return data
+
+
+def rawpy() -> Any:
+    """The library that reads cameras' raw files. **Errors**: ImageFileError where it is not."""
+    try:
+        import rawpy
+    except ImportError:
+        raise ImageFileError(
+            "is a camera's raw file; pip install 'thincam_jax[raw]', or save it as TIFF"
+        ) from None
+    return rawpy
 
 
 def npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:

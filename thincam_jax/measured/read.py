@@ -20,11 +20,13 @@ from jaxtyping import Bool
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import open_regular
 from thincam_jax._core.image_files import (
+    RAW_SUFFIXES,
     ImageFileError,
     kind_of,
     kind_of_start,
     npy_header,
     png_header,
+    rawpy,
     read_whole,
     tiff_pages,
     whole_of,
@@ -36,8 +38,6 @@ from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
 _Facts = dict[str, Any]  # bits, orientation, and those of `Raw`, where a file says them
 
-# Raw files of cameras, most of which are TIFF with previews of their own.
-RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
 SUFFIXES = (".tif", ".tiff", ".png", ".npy", ".pgm", ".ppm", ".fits", *RAW_SUFFIXES)
 _KEYED = re.compile(r"(?i)(.+\.(?:npz|mat|h5|hdf5|fits?)):(.+)")
 # By their first bytes, or those after a length: names, and what imageio is to read.
@@ -270,8 +270,6 @@ def _kind(path: Path) -> str:
         raise CaptureFileError(f"{path}: is a folder; give the path of one image") from None
     except OSError as error:
         raise CaptureFileError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if kind is not None and path.suffix.lower() in RAW_SUFFIXES:
-        return "raw"
     if kind is None:
         raise CaptureFileError(f"{path}: {_true_name(path)}")
     if not kind:
@@ -333,13 +331,7 @@ def _by_pillow(data: bytes) -> tuple[np.ndarray, _Facts]:
 
 def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
     """The mosaic of a camera's raw file, without the rows and columns beyond its image."""
-    try:
-        import rawpy
-    except ImportError:
-        raise CaptureFileError(
-            "is a camera's raw file; pip install 'thincam_jax[raw]', or save it as TIFF"
-        ) from None
-    with rawpy.imread(io.BytesIO(data)) as file:
+    with rawpy().imread(io.BytesIO(data)) as file:
         pixels = file.raw_image_visible.copy()
         if pixels.ndim != 2:
             raise CaptureFileError("holds colours, no mosaic; save it as TIFF")

@@ -115,8 +115,11 @@ def consensus(splitting: AbstractSplitting, state: State) -> State:
 
 def rescaled(splitting: AbstractSplitting, state: State, factors: Penalties) -> State:
     """The state that keeps image and forces when penalties are multiplied: q = z + λ, λ ∝ 1/μ."""
-    settled = consensus(splitting, state)
+    return _rescaled(state, _consensus(splitting, state), factors)
 
+
+@jax.jit
+def _rescaled(state: State, settled: State, factors: Penalties) -> State:
     def scaled(part, factor):
         return jax.tree.map(lambda q, z: z + (q - z) / factor, *part)
 
@@ -125,6 +128,10 @@ def rescaled(splitting: AbstractSplitting, state: State, factors: Penalties) -> 
         scaled((state.slopes, settled.slopes), factors.variation),
         scaled((state.image, settled.image), factors.image),
     )
+
+
+# Judging and adapting share this program: within theirs it takes longer to compile.
+_consensus = eqx.filter_jit(consensus)
 
 
 def squared_sizes(*states: State) -> Float[Array, "state 3"]:
@@ -162,8 +169,8 @@ class Admm(optimistix.AbstractFixedPointSolver):
 
     - `rtol`: `AdmmState.change` must fall below it. `atol` and `norm` are not used.
     - `relaxation`: α, 0 < α < 2.
-    - `judged`: whether steps are judged, which takes half of the time to compile and a tenth of it
-      to run.
+    - `judged`: whether steps are judged; `AdmmMethod` judges the last of several by itself, in half
+      of the time to compile.
     """
 
     rtol: Any
@@ -187,7 +194,10 @@ class Admm(optimistix.AbstractFixedPointSolver):
         mapped, aux = fn(y, args)
         relaxation = self.relaxation.astype(y.image.dtype)
         after = jax.tree.map(lambda q, t: q + relaxation * (t - q), y, mapped)
-        return after, _judged(args, y, after, relaxation) if self.judged else state, aux
+        if self.judged:
+            settled = consensus(args, y), consensus(args, after)
+            state = _judged(args.penalties, (y, after), settled, relaxation)
+        return after, state, aux
 
     def terminate(self, fn, y, args, options, state, tags):
         enough = state.change < self.rtol.astype(state.change.dtype)
@@ -197,15 +207,19 @@ class Admm(optimistix.AbstractFixedPointSolver):
         return y, aux, {}
 
 
-def _judged(splitting: AbstractSplitting, before: State, after: State, relaxation):
-    """Residuals of a step: distance of K f from z, and change of z, relative to the duals."""
-    old, new = consensus(splitting, before), consensus(splitting, after)
+@jax.jit
+def _judged(penalties: Penalties, states, settled, relaxation) -> AdmmState:
+    """Residuals of a step: distance of K f from z, and change of z, relative to the duals.
+
+    - `states`: before and after it. `settled`: z of both.
+    """
+    (before, after), (old, new) = states, settled
     gap = jax.tree.map(lambda a, b: (a - b) / relaxation, after, before)
     image = jax.tree.map(jnp.add, old, gap)  # K f
     move, pull = (jax.tree.map(jnp.subtract, *pair) for pair in ((new, old), (after, new)))
     gaps, *sizes, moved, force, begun = squared_sizes(gap, image, old, move, pull, before)
     size = jnp.maximum(*sizes)
-    weights = jnp.stack(jax.tree.leaves(splitting.penalties))
+    weights = jnp.stack(jax.tree.leaves(penalties))
 
     def over(a, b):
         return jnp.sqrt(jnp.where(b > 0, a / jnp.where(b > 0, b, 1), 0))
@@ -223,13 +237,15 @@ def _judged(splitting: AbstractSplitting, before: State, after: State, relaxatio
 class AdmmMethod(OptimistixMethod):
     """ADMM for a problem and its splitting; residual balancing adapts the penalties.
 
-    - `relaxation`: α, 0 < α < 2. `judged`: see `Admm`; penalties do not adapt without.
+    - `relaxation`: α, 0 < α < 2.
+    - `judged`: whether the last of several steps is judged; penalties do not adapt without.
     """
 
     problem: InverseProblem
     arguments: AbstractSplitting
     solver: Any
-    donated = True
+    judged: bool = eqx.field(static=True)
+    donated, judging = True, False
 
     def __init__(
         self,
@@ -239,12 +255,22 @@ class AdmmMethod(OptimistixMethod):
         *,
         judged: bool = True,
     ):
-        self.problem, self.arguments = problem, splitting
-        self.solver = Admm(0.0, relaxation, judged=judged)
+        self.problem, self.arguments, self.judged = problem, splitting, judged
+        self.solver = Admm(0.0, relaxation, judged=False)
 
-    @property
-    def judged(self):
-        return self.solver.judged
+    def advance(self, state: SolverState, count: int):
+        if not self.judged:
+            return super().advance(state, count)
+        state = super().advance(state, count - 1)
+        before = jax.device_put(state.value, may_alias=False)  # the last step reuses its memory
+        state = super().advance(state, 1)
+        settled = _consensus(self.arguments, before), _consensus(self.arguments, state.value)
+        relaxation = self.solver.relaxation.astype(before.image.dtype)
+        judged = _judged(self.arguments.penalties, (before, state.value), settled, relaxation)
+        return SolverState(state.value, judged)
+
+    def residuals(self, state: SolverState):
+        return super().residuals(state) if self.judged else Residuals(math.nan, math.nan)
 
     @staticmethod
     def function(value: State, arguments: AbstractSplitting):
@@ -269,7 +295,7 @@ class AdmmMethod(OptimistixMethod):
         dtype = self.problem.captures[0].dtype
         wanted = Penalties(*(jnp.asarray(f, dtype) for f in factors))
         penalties = jax.tree.map(jnp.multiply, self.arguments.penalties, wanted)
-        value = _rescaled(self.arguments, state.value, wanted)
+        value = rescaled(self.arguments, state.value, wanted)
         other = self.arguments.with_penalties(penalties)
         method = eqx.tree_at(lambda m: m.arguments, self, other)
         return method, eqx.tree_at(lambda s: s.value, state, value)
@@ -282,6 +308,3 @@ def _ratio(primal: float, dual: float) -> float:
     if not (primal > 0 and dual > 0):
         return 1.0
     return min(9.0, max(1 / 9.0, primal / dual))
-
-
-_rescaled = eqx.filter_jit(rescaled)

@@ -114,16 +114,13 @@ class OptimistixMethod(AbstractMethod[SolverState]):
 
     - `solver`, and `arguments` of its function.
     - `donated`: whether the next state reuses the memory of the last.
-    - `judged`: whether the solver finds the residuals of its steps, else they are NaN.
+    - `judging`: whether the solver finds the residuals of its steps.
     """
 
     solver: eqx.AbstractVar[Any]
     arguments: eqx.AbstractVar[Any]
     donated: ClassVar[bool] = False
-
-    @property
-    def judged(self) -> bool:
-        return True
+    judging: ClassVar[bool] = True
 
     @staticmethod
     @abc.abstractmethod
@@ -149,8 +146,6 @@ class OptimistixMethod(AbstractMethod[SolverState]):
         return _image(self, state)
 
     def residuals(self, state: SolverState):
-        if not self.judged:
-            return Residuals(math.nan, math.nan)
         inside = jax.device_get(state.inside)
         parts = tuple((float(p), float(d)) for p, d in getattr(inside, "parts", ()))
         return Residuals(float(inside.primal), float(inside.dual), parts)
@@ -279,7 +274,7 @@ def _start(method: OptimistixMethod, image) -> SolverState:
 
 
 def _steps(method: OptimistixMethod, state: SolverState, count: Any) -> SolverState:
-    """`count` steps: a loop of any length, and the last one, which alone is judged.
+    """`count` steps: a loop of any length; if the solver judges, the last step is outside of it.
 
     What a solver computes for its residuals only, the compiler drops from the loop.
     """
@@ -290,7 +285,7 @@ def _steps(method: OptimistixMethod, state: SolverState, count: Any) -> SolverSt
         )
         return SolverState(value, inside)
 
-    if not method.judged:
+    if not method.judging:
         return jax.lax.fori_loop(0, count, step, state)
     return step(0, jax.lax.fori_loop(1, count, step, state))
 

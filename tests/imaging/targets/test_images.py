@@ -7,6 +7,7 @@ import pytest
 import skimage.data
 import skimage.io
 import tifffile
+from raw_files import SRGB, dng
 
 from thincam_jax import load_image
 from thincam_jax.imaging.targets import resize, sample_image
@@ -45,6 +46,29 @@ def test_alpha_is_dropped_and_channels_keep_their_order(tmp_path):
     assert image[8, 13].tolist() == [0.0, 0.0, 1.0]
     grey = write(tmp_path / "b.png", pixels[..., :2])
     np.testing.assert_allclose(load_image(grey, linear=True), pixels[..., 0] / 255)
+
+
+@pytest.mark.parametrize("name", ["a.dng", "a.DNG", "a.tif"])
+def test_a_raw_photograph_is_its_colours(tmp_path, name):
+    """Black and white level, mosaic and orientation are the file's; sRGB's primaries, linear."""
+    left, right = (600, 900, 300), (3400, 3400, 3400)
+    light = np.repeat(np.transpose([left, right])[:, None], 24, axis=-1).repeat(32, axis=1)
+    path = tmp_path / name
+    path.write_bytes(dng("BGGR", 6, light=light, matrix=SRGB))
+    image = load_image(path)
+    assert image.shape == (32, 48, 3)
+    for columns, colour in ((slice(8, 16), left), (slice(32, 40), right)):
+        found = image[8:24, columns].mean((0, 1))
+        np.testing.assert_allclose(found, np.array(colour) / (4095 - 256), rtol=0.01)
+    np.testing.assert_array_equal(load_image(path, linear=True), image)
+
+
+def test_a_mosaic_is_no_photograph(tmp_path):
+    sites = [(33421, 3, 2, (2, 2), True), (33422, 1, 4, (0, 1, 1, 2), True)]
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.ones((8, 6), np.uint16), photometric=32803, extratags=sites)
+    with pytest.raises(ValueError, match="holds a colour filter's mosaic; save its colours as"):
+        load_image(path)
 
 
 def test_no_file_and_folder(tmp_path):

@@ -16,8 +16,10 @@ from jaxtyping import ArrayLike, Float64, Num
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.image_files import ImageFileError, kind_of, png_header, read_whole
+from thincam_jax._core.image_files import ImageFileError, kind_of, png_header, rawpy, read_whole
 from thincam_jax.imaging.encoding import ORIENTATION, decoded, upright
+
+_DNG_VERSION = 50706  # tag
 
 # Files inside the scikit-image package itself; other names of `skimage.data` need a download.
 _PLAIN = (
@@ -47,7 +49,8 @@ def load_image(
     image is turned upright, as its orientation (EXIF, TIFF) says.
 
     Unsigned integers of any depth are divided by their largest value, floats must be in [0, 1]
-    already. An alpha channel is dropped, not blended.
+    already. An alpha channel is dropped, not blended. Colours of a camera's raw file (DNG and
+    others) are LibRaw's, with the white balance of the camera.
 
     Raises FileNotFoundError if there is no such file; ValueError for a folder, a file that is no
     image or is damaged, an empty image, a stack of several, or values out of range.
@@ -74,7 +77,8 @@ def load_image(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             data = read_whole(path, kind := kind_of(path))
-            pixels, tags, orientation = (_read_tiff if kind == "tiff" else _read_other)(data)
+            reader = {"tiff": _read_tiff, "raw": _read_raw}.get(kind or "", _read_other)
+            pixels, tags, orientation = reader(data)
     except ImageFileError as error:
         raise ValueError(f"{str(path)!r} {error}") from None
     except Exception as error:  # each decoder raises its own kind
@@ -91,13 +95,25 @@ def _read_tiff(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
     """Pixels as stored, tags of their encoding, and their orientation."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = file.pages[0].aspage()
+        if _DNG_VERSION in page.tags:
+            return _read_raw(data)
         if page.photometric in (3, 5):  # a palette, inks
             return _read_other(data)
+        if page.photometric == tifffile.PHOTOMETRIC.CFA:
+            raise ImageFileError("holds a colour filter's mosaic; save its colours as TIFF or PNG")
         pixels, found = file.asarray(), page.tags.get(ORIENTATION)
         tags = {"icc_profile": page.tags.valueof("InterColorProfile")}
     if page.photometric == 0 and pixels.dtype.kind == "u":
         pixels = np.iinfo(pixels.dtype).max - pixels
     return pixels, tags, found.value if found else 1
+
+
+def _read_raw(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
+    """Colours of a raw file, linear and upright, in the primaries of sRGB."""
+    with rawpy().imread(io.BytesIO(data)) as file:
+        # The white level stays that of the file, however bright the picture is.
+        scale = {"no_auto_bright": True, "adjust_maximum_thr": 0.0, "output_bps": 16}
+        return file.postprocess(gamma=(1, 1), use_camera_wb=True, **scale), {}, 1
 
 
 def _read_other(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
