@@ -6,6 +6,7 @@ import threading
 import numpy as np
 import PIL.Image
 import pytest
+import scipy.io
 
 from thincam_jax.measured import MeasurementError, Preparation, Raw, prepare
 from thincam_jax.measured.layouts import open_pairs, with_psf
@@ -129,6 +130,7 @@ class TestParquet:
         np.testing.assert_array_equal(pair.psf.pixels, image(8))
         np.testing.assert_array_equal(pair.background.pixels, codes(71))
         assert with_psf(open_pairs(root), psfs)[2].psf is None  # label 9
+        assert open_pairs(root)[0].psf is None  # psf.png is of no mask by its label
 
     def test_other_columns(self, tmp_path):
         import pyarrow as pa
@@ -176,6 +178,16 @@ class TestFolders:
         PIL.Image.fromarray(np.full((8, 8, 3), 188, np.uint8)).save(tmp_path / "truths" / "x.jpg")
         truth = open_pairs(tmp_path)[0].truth  # a warning would be an error
         np.testing.assert_allclose(truth, 0.503, atol=0.002)
+
+    def test_arrays_of_matlab(self, tmp_path):
+        for name in ("captures", "truths"):
+            (tmp_path / name).mkdir()
+            for n in (9, 10):
+                arrays = {"image": 10.0 * n + image(n)}
+                scipy.io.savemat(tmp_path / name / f"im{n}.mat", arrays)
+        pairs = open_pairs(tmp_path)
+        assert list(pairs.names) == ["im9", "im10"]
+        np.testing.assert_array_equal(pairs[1].capture.pixels, 100 + image(10))
 
     def test_lone_captures(self, tmp_path):
         self.write(tmp_path)
@@ -273,6 +285,10 @@ class TestMatched:
 
     def test_outside(self):
         log = self.prepared((12, 20)).log
+        with pytest.raises(MeasurementError, match="9×20 pixels do not cover the capture of 12×20"):
+            TruthAlignment().matched(
+                np.zeros((1, 12, 20), np.float32), np.zeros((1, 9, 20), np.float32), log
+            )
         with pytest.raises(MeasurementError, match="30:40, of which the capture has none"):
             TruthAlignment((30, 40), (0, 9)).matched(
                 np.zeros((1, 12, 20), np.float32), np.zeros((1, 5, 5), np.float32), log

@@ -56,14 +56,14 @@ def kind_of(path: str | os.PathLike[str]) -> str | None:
     "" of a file that ends within these bytes, None of others.
     """
     with open_regular(path) as (file, _):
-        return kind_of_start(file.read(8))
+        return kind_of_start(file.read(8), Path(path).suffix)
 
 
-def kind_of_start(start: bytes) -> str | None:
-    """`kind_of` by the first 8 bytes."""
+def kind_of_start(start: bytes, suffix: str = "") -> str | None:
+    """`kind_of` by the first 8 bytes, and the suffix of the name."""
     if any(one.startswith(start) and one != start for one in _STARTS):
         return ""
-    if Path(path).suffix.lower() in RAW_SUFFIXES:
+    if suffix.lower() in RAW_SUFFIXES:
         return "raw"
     return next((kind for one, kind in _STARTS.items() if start.startswith(one)), None)
 

@@ -10,6 +10,7 @@ import csv
 import dataclasses
 import hashlib
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +20,21 @@ import yaml
 from thincam_jax._core.files import file_digest, read_regular
 from thincam_jax._core.text import shortened
 from thincam_jax.measured.pairs import Pairs, Stored, TruthAlignment
-from thincam_jax.measured.raw import CaptureFileError, MeasurementError
-from thincam_jax.measured.read import SUFFIXES, image_files, read_image, read_photograph
+from thincam_jax.measured.raw import MeasurementError
+from thincam_jax.measured.read import (
+    SUFFIXES,
+    image_files,
+    natural_order,
+    read_image,
+    read_photograph,
+)
 
 _FOLDERS = (
     *(("captures", "truths"), ("lensless", "lensed"), ("measured", "original")),
     ("measured", "originals"),
 )
 _DIFFUSERCAM = (("diffuser_images", "ground_truth_lensed"), ("diffuser", "lensed"))
-_TRUTHS = (*SUFFIXES, ".jpg", ".jpeg", ".mat", ".npz")
+_ARRAYS = (".mat", ".npz", ".h5", ".hdf5")  # of one array each
 _IMAGES = ("tiff", "tif", "png", "npy")
 _PSFS = ("psf", "psf_measured", "psf_simulated")
 _KNOWN = (
@@ -68,14 +75,14 @@ class FilePairs:
 
     def read(self, number: int, bits: int | None) -> Stored:
         capture, path = read_image(self.captures[number], bits=bits), self.truths[number]
-        bare = path.suffix.lower() in (".mat", ".npz")
-        truth = read_image(path) if bare else read_photograph(read_regular(path), str(path))
+        is_array = path.suffix.lower() in _ARRAYS
+        truth = read_image(path) if is_array else read_photograph(read_regular(path), str(path))
         if self.reversed_colours:
             capture, truth = (
                 dataclasses.replace(one, pixels=one.pixels[..., ::-1]) if one.channels == 3 else one
                 for one in (capture, truth)
             )
-        return Stored(self.names[number], capture, truth)
+        return Stored(self.captures[number].stem, capture, truth)
 
     def digest(self, number: int) -> str:
         files = file_digest(self.captures[number]), file_digest(self.truths[number])
@@ -129,11 +136,10 @@ def with_psf(pairs: Pairs, psf: Path) -> Pairs:
     """
     if not psf.is_dir():
         return dataclasses.replace(pairs, psfs={None: psf})
-    digits = {file: "".join(c for c in file.stem if c.isdigit()) for file in image_files(psf)}
-    if not all(digits.values()):
-        name = next(file for file, label in digits.items() if not label).name
-        raise MeasurementError(f"{psf}: {name} has no label; name PSFs by their masks, psf_3.npy")
-    return dataclasses.replace(pairs, psfs={int(label): file for file, label in digits.items()})
+    labels = {file: re.findall(r"\d+", file.stem)[-1:] for file in image_files(psf)}
+    if lone := [file.name for file, label in labels.items() if not label]:
+        raise MeasurementError(f"{psf}: {lone[0]} has no label; name PSFs by masks, psf_3.npy")
+    return dataclasses.replace(pairs, psfs={int(*n): file for file, n in labels.items()})
 
 
 def chosen_split(path: Path, splits: Mapping[str, int], split: str | None) -> str:
@@ -213,12 +219,8 @@ def _two(path: Path) -> tuple[str, str] | tuple[()]:
 
 def _paired(path: Path, captures: str, truths: str) -> list[tuple[Path, Path]]:
     """Files of both folders with the same name; MeasurementError where none has a partner."""
-    entries = (p for p in (path / truths).iterdir() if p.suffix.lower() in _TRUTHS)
-    by_name = {file.stem: file for file in entries}
-    try:
-        listed = image_files(path / captures)
-    except CaptureFileError:
-        listed = []
+    by_name = {file.stem: file for file in _listing(path / truths, ".jpg", ".jpeg")}
+    listed = _listing(path / captures)
     found = [(file, by_name[file.stem]) for file in listed if file.stem in by_name]
     if not found or len(found) < len(listed):
         lone = next((file.name for file in listed if file.stem not in by_name), "no capture")
@@ -227,6 +229,13 @@ def _paired(path: Path, captures: str, truths: str) -> list[tuple[Path, Path]]:
             f"name in {truths}/ ({lone} has none); give each capture its truth"
         )
     return found
+
+
+def _listing(folder: Path, *more: str) -> list[Path]:
+    """Files of images and arrays, im9 before im10, no hidden ones."""
+    known = (*SUFFIXES, *_ARRAYS, *more)
+    files = (p for p in folder.iterdir() if p.suffix.lower() in known and p.name[0] != ".")
+    return sorted(files, key=natural_order)
 
 
 def _parquet(path: Path, split: str | None) -> Pairs | None:

@@ -29,6 +29,7 @@ ENCODINGS: dict[Encoding | None, str] = {
     None: "decoded from sRGB where they have 8 bit, else linear in light",
 }
 Span = tuple[int, int]
+_STRETCHED = 0.02  # ratio of the truth's pixels that nobody stated
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class TruthAlignment:
         """
         halved = log.options.bayer is not None and log.options.demosaicing == "superpixel"
         parts: list[tuple[slice, slice]] = []
+        scales: list[float] = []
         for axis, span in enumerate((self.rows, self.columns)):
             whole = log.capture.shape[axis] // (2 if halved else 1)
             low, high = (n // (2 if halved else 1) for n in span) if span else (0, whole)
@@ -84,8 +86,14 @@ class TruthAlignment:
                     f"others, up to {whole}"
                 )
             pixel, scale = size / image.shape[1 + axis], truth.shape[1 + axis] / (high - low)
+            scales.append(scale)
             here = slice(round((first - begin) / pixel), round((last - begin) / pixel))
             parts.append((here, slice(round((first - low) * scale), round((last - low) * scale))))
+        if self.source == TruthAlignment.source and abs(scales[0] / scales[1] - 1) > _STRETCHED:
+            raise MeasurementError(
+                f"truths of {truth.shape[1]}×{truth.shape[2]} pixels do not cover the capture of "
+                f"{log.capture.shape[0]}×{log.capture.shape[1]}; give what they cover: --truth-area"
+            )
         image = image[:, ::-1, ::-1] if self.turned else image
         (rows, seen_rows), (columns, seen_columns) = parts
         image, truth = image[:, rows, columns], truth[:, seen_rows, seen_columns]
@@ -206,7 +214,7 @@ class Pairs:
 
     def psf_file(self, label: int | None = None) -> Path | None:
         """The PSF's file of a mask; None where there is none."""
-        return self.psfs.get(label, self.psfs.get(None))
+        return self.psfs.get(label)
 
     def digest(self, number: int) -> str:
         """SHA-256 of all that is stored of a pair."""

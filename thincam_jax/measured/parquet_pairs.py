@@ -38,7 +38,8 @@ class ParquetPairs:
 
     def read(self, number: int, bits: int | None) -> Stored:
         row, name = self._row(number), self.names[number]
-        capture, truth, ambient = (_image(row.get(one), f"{name}, {one}") for one in _IMAGES)
+        depths = zip(_IMAGES, (bits, None, bits), strict=True)
+        capture, truth, ambient = (_image(row.get(n), f"{name}, {n}", depth) for n, depth in depths)
         if capture is None or truth is None:
             raise MeasurementError(f"{name}: a column of images is empty")
         return Stored(name, capture, truth, ambient, row.get("mask_label"))
@@ -96,9 +97,9 @@ def _rows(file: Path, group: int) -> Any:
         raise MeasurementError(f"{file}: cannot be read ({of_error(error)})") from None
 
 
-def _image(held: Any, name: str) -> Raw | None:
+def _image(held: Any, name: str, bits: int | None) -> Raw | None:
     data = held and held.get("bytes")
-    return read_photograph(data, name) if data else None
+    return read_photograph(data, name, bits) if data else None
 
 
 def _library() -> Any:

@@ -181,7 +181,7 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
         raise CaptureFileError(
             f"{folder}: holds no capture; give a folder of TIFF, PNG, NPY or raw files"
         )
-    return sorted(paths, key=_order)
+    return sorted(paths, key=natural_order)
 
 
 def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
@@ -201,7 +201,8 @@ def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
     return alike or list(named.values())
 
 
-def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
+def natural_order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Key by which capture_9 comes before capture_10."""
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
 
