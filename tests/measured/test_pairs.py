@@ -171,6 +171,23 @@ class TestFolders:
         with pytest.raises(MeasurementError, match="no split 'val'; there are all, test, train"):
             open_pairs(tmp_path, "val")
 
+    def test_lists_of_flatnet(self, tmp_path):
+        """Folders by class, x..png beside x.JPEG, lists with the paths of their authors."""
+        for n in (1, 2, 11):
+            for folder, name in (("caps_1cap", f"a/n_{n}..png"), ("orig", f"a/n_{n}.JPEG")):
+                (tmp_path / folder / "a").mkdir(parents=True, exist_ok=True)
+                PIL.Image.fromarray(codes(n)).save(tmp_path / folder / name)
+        (tmp_path / "filenames").mkdir()
+        for split, numbers in (("train", (1, 2)), ("val", (11,))):
+            lines = [f"Amplitude Mask/dataset/caps_1cap/a/n_{n}..png" for n in numbers]
+            (tmp_path / "filenames" / f"{split}_meas_ilsvrc_flatcam.txt").write_text(
+                "\n".join(lines)
+            )
+        pairs = open_pairs(tmp_path, "train")
+        assert (list(pairs.names), pairs.splits) == (["n_1", "n_2"], {"train": 2, "val": 1})
+        assert len(open_pairs(tmp_path)) == 3
+        assert pairs[1].truth.shape == (3, *SHAPE)
+
     def test_jpeg_truths_are_silent(self, tmp_path):
         (tmp_path / "captures").mkdir()
         (tmp_path / "truths").mkdir()

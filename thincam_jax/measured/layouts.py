@@ -3,7 +3,9 @@
 - DiffuserCam (Monakhova et al., Opt. Express 27, 28075, 2019; Waller-Lab/LenslessLearning,
   commit eaab0fb): float NPY, blue, green, red, upside down; a PSF of four times the pixels.
 - Hugging Face (LCAV/LenslessPiCam, commit dcb4aba): Parquet, see `measured.parquet_pairs`.
-- Two folders of files with the same names, which may lie in a folder for each split.
+- Two folders of files with the same names, which may lie in a folder for each split, and in folders
+  of their own. FlatNet (Khan et al., TPAMI 2020; siddiquesalman/flatnet, commits 2a5da19, d1dc179)
+  lists the captures of its splits in text files, val_meas_….txt or val_source_….txt.
 """
 
 import csv
@@ -32,7 +34,9 @@ from thincam_jax.measured.read import (
 _FOLDERS = (
     *(("captures", "truths"), ("lensless", "lensed"), ("measured", "original")),
     ("measured", "originals"),
+    *(("caps_1cap", "orig"), ("imagenet_caps_384_12bit_Feb_19", "orig")),  # FlatNet's
 )
+_LISTS = ("filenames", "text_files", "data/text_files", ".")  # FlatNet's, of names of captures
 _DIFFUSERCAM = (("diffuser_images", "ground_truth_lensed"), ("diffuser", "lensed"))
 _ARRAYS = (".mat", ".npz", ".h5", ".hdf5")  # of one array each
 _IMAGES = ("tiff", "tif", "png", "npy")
@@ -71,7 +75,7 @@ class FilePairs:
 
     @property
     def names(self) -> Sequence[str]:
-        return [path.stem for path in self.captures]
+        return [_name(path) for path in self.captures]
 
     def read(self, number: int, bits: int | None) -> Stored:
         capture, path = read_image(self.captures[number], bits=bits), self.truths[number]
@@ -82,7 +86,7 @@ class FilePairs:
                 dataclasses.replace(one, pixels=one.pixels[..., ::-1]) if one.channels == 3 else one
                 for one in (capture, truth)
             )
-        return Stored(self.captures[number].stem, capture, truth)
+        return Stored(_name(self.captures[number]), capture, truth)
 
     def digest(self, number: int) -> str:
         files = file_digest(self.captures[number]), file_digest(self.truths[number])
@@ -207,8 +211,12 @@ def _folders(path: Path, split: str | None) -> Pairs | None:
     if not roots:
         return None
     files = {name: _paired(root, *_two(root)) for name, root in roots.items()}
+    if here and (named := _lists(path)):
+        every = files["all"]
+        files = {n: [p for p in every if p[0].name in names] for n, names in named.items()}
+        files = {name: pairs for name, pairs in files.items() if pairs} or {"all": every}
     splits = {name: len(pairs) for name, pairs in files.items()}
-    split = "all" if here and split is None else chosen_split(path, splits, split)
+    split = chosen_split(path, splits, split)
     chosen = [p for name, pairs in files.items() if split in (name, "all") for p in pairs]
     return Pairs("two folders", path, _files(chosen), split, splits)
 
@@ -219,11 +227,11 @@ def _two(path: Path) -> tuple[str, str] | tuple[()]:
 
 def _paired(path: Path, captures: str, truths: str) -> list[tuple[Path, Path]]:
     """Files of both folders with the same name; MeasurementError where none has a partner."""
-    by_name = {file.stem: file for file in _listing(path / truths, ".jpg", ".jpeg")}
+    by_name = {_name(file): file for file in _listing(path / truths, ".jpg", ".jpeg")}
     listed = _listing(path / captures)
-    found = [(file, by_name[file.stem]) for file in listed if file.stem in by_name]
+    found = [(file, by_name[_name(file)]) for file in listed if _name(file) in by_name]
     if not found or len(found) < len(listed):
-        lone = next((file.name for file in listed if file.stem not in by_name), "no capture")
+        lone = next((file.name for file in listed if _name(file) not in by_name), "no capture")
         raise MeasurementError(
             f"{path}: of {len(listed)} files in {captures}/ {len(found)} have a partner of their "
             f"name in {truths}/ ({lone} has none); give each capture its truth"
@@ -232,10 +240,26 @@ def _paired(path: Path, captures: str, truths: str) -> list[tuple[Path, Path]]:
 
 
 def _listing(folder: Path, *more: str) -> list[Path]:
-    """Files of images and arrays, im9 before im10, no hidden ones."""
+    """Files of images and arrays, also in folders, im9 before im10, no hidden ones."""
     known = (*SUFFIXES, *_ARRAYS, *more)
-    files = (p for p in folder.iterdir() if p.suffix.lower() in known and p.name[0] != ".")
+    files = (p for p in folder.rglob("*") if p.suffix.lower() in known and p.name[0] != ".")
     return sorted(files, key=natural_order)
+
+
+def _name(file: Path) -> str:
+    """Name that capture and truth share: x of x.JPEG and of FlatNet's x..png."""
+    return file.stem.rstrip(".")
+
+
+def _lists(path: Path) -> dict[str, set[str]]:
+    """Names of the captures that FlatNet lists, by split."""
+    found: dict[str, set[str]] = {}
+    for file in (file for folder in _LISTS for file in (path / folder).glob("*.txt")):
+        split, _, kind = file.stem.partition("_")
+        if kind.split("_")[0] in ("meas", "source"):
+            lines = read_regular(file).decode("utf-8", "replace").splitlines()
+            found.setdefault(split, set()).update(line.split("/")[-1].strip() for line in lines)
+    return found
 
 
 def _parquet(path: Path, split: str | None) -> Pairs | None:
