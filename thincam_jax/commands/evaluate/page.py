@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from thincam_jax.commands.evaluate.run import Evaluated
 
 _NEEDED = ("dataset", "method", "protocol", "source")
-_MOST = 10  # failures that a page lists
+_MOST = 10  # failures, and findings, that a page lists
 
 
 def whole_page(
@@ -44,18 +44,23 @@ def whole_page(
         "of the capture, ‖Hf − g‖/‖g‖. Seconds are the median's.",
         "Images are those of `thincam reconstruct` with the same options.",
     ]
-    failed = [f"{name}: {reason}" for name, reason in list(found.failures.items())[:_MOST]]
-    if more := len(found.failures) - len(failed):
-        failed.append(f"and {more} more")
+    failed = _first([f"{name}: {reason}" for name, reason in found.failures.items()])
+    findings = _first([f"{name}: {'; '.join(words)}" for name, words in found.findings.items()])
     others = (published, "Protocols differ from ours and from each other.") if published else ()
     parts = (
         *pictures,
         Part("How images and truths are compared", (Sentences(lines),), "Comparison"),
         Part("Published figures", others),
         Part("Failed", (Sentences(failed),) if failed else ()),
+        Part("Findings in files and images", (Sentences(findings),) if findings else ()),
         Part("Data set", (facts_table(pairs),)),
     )
     return Page((scores_table(found.scores),), parts, command="")
+
+
+def _first(lines: list[str]) -> list[str]:
+    more = len(lines) - _MOST
+    return [*lines[:_MOST], *([f"and {more} more images"] if more > 0 else [])]
 
 
 def pictures(

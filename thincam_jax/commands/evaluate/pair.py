@@ -3,6 +3,7 @@
 import functools
 import json
 import traceback
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ class Scored:
     """Scores of a pair by a method; or why there are none, in one line.
 
     - `key`: digest of all that they depend on.
-    - `scores`: numbers by name. `seconds`: time of the reconstruction.
+    - `scores`: numbers by name, and findings. `seconds`: time of the reconstruction.
     - `shown`: capture, image and truth (channel, y, x), where they were asked for.
     """
 
@@ -50,16 +51,18 @@ def score_pair(
     """Scores of a pair; `config`: an `EvaluationConfig` as JSON. An error is an outcome, too."""
     key = ""
     try:
-        with double_precision(double):
-            asked, pairs = opened(config)
+        with double_precision(double), warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            _, pairs = opened(config)
             key = key_of(config, method, number, double)
             pair = pairs[number]
-            found, seconds, residual, status = reconstructed(config, method, pair)
+            found, seconds, others = reconstructed(config, method, pair)
     except (MeasurementError, MemoryError, OSError) as error:
         return Scored(key, reason="; ".join(str(error).splitlines()))
     except Exception as error:  # the others go on without a pair that shows a defect
         return Scored(key, reason=one_line(error), traceback=traceback.format_exc())
-    scores = asdict(found) | {"residual": residual, "status": status}
+    scores = asdict(found) | others
+    scores["findings"] += [str(one.message) for one in warned]
     image, truth = scores.pop("image"), scores.pop("truth")
     light = np.moveaxis(np.atleast_3d(pair.capture.pixels), -1, 0).astype(np.float32)
     if pairs.alignment.turned:
@@ -71,8 +74,8 @@ def score_pair(
 
 def reconstructed(
     config: str, method: str, pair: PairedCapture
-) -> tuple[Agreement, float, float, str]:
-    """Agreement, seconds, relative residual and status, by the steps of `thincam reconstruct`."""
+) -> tuple[Agreement, float, dict[str, Any]]:
+    """Agreement, seconds and further results, by the steps of `thincam reconstruct`."""
     asked, pairs = opened(config)
     recipe, rig = asked.recipe(method), _rig(config, pair.mask_label, *_ratio(pair))
     capture = pair.capture
@@ -90,7 +93,9 @@ def reconstructed(
         raise MeasurementError(f"{pair.name}: the image became NaN or infinite")
     both = pairs.alignment.matched(done.image(), pair.truth, ready.log)
     found = agreement(*both, fit=asked.fit, shift=asked.shift)
-    return found, done.found.seconds, done.relative_residual, done.found.status
+    others = {"residual": done.relative_residual, "status": done.found.status}
+    findings = [str(one) for one in (*examined.findings, done.found.reason) if str(one)]
+    return found, done.found.seconds, {**others, "findings": findings}
 
 
 def key_of(config: str, method: str, number: int, double: bool) -> str:

@@ -79,10 +79,11 @@ class PairTask:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """End of an evaluation: scores of each method, and why others have none."""
+    """End of an evaluation: scores of each method, why others have none, and findings."""
 
     scores: tuple[MethodSummary, ...]
     failures: dict[str, str]
+    findings: dict[str, list[str]]
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ def run_evaluation(
         parts.append(page.pictures(folder, word, name, one, psnrs))
     counts = Counter(task.method for task in failures)
     reasons = {task.file: reason for task, reason in failures.items()}
-    found = Evaluated(summarised(rows, counts), reasons)
+    findings = {f"{r['method']}, {r['name']}": r["findings"] for r in rows if r["findings"]}
+    found = Evaluated(summarised(rows, counts), reasons, findings)
     whole = page.whole_page(config, opened(text)[1], found, parts, beside)
     surroundings = environment(time.time() - began)
     folder.write("report.html", render_report(whole, config, folder.path, surroundings, "images"))
