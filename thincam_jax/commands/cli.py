@@ -37,8 +37,8 @@ GROUPS = {
     ),
     "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
     "Image": ("field", "flip", "linear", "gamma", "white_balance"),
-    "Comparison": ("truth", "truth_area", "fit", "shift", "published"),
 }
+_COMPARISON = {"Comparison": ("truth", "truth_area", "fit", "shift", "published")}
 
 
 class InOrder(TyperGroup):
@@ -97,8 +97,9 @@ class Grouped(Once):
         return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        group_of = {name: group for group, names in GROUPS.items() for name in names}
-        rows: dict[str, list] = {"Options": [], **{group: [] for group in GROUPS}}
+        groups = GROUPS | _COMPARISON
+        group_of = {name: group for group, names in groups.items() for name in names}
+        rows: dict[str, list] = {"Options": [], **{group: [] for group in groups}}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is not None:
