@@ -217,7 +217,7 @@ def _decode(
     named = _KEYED.fullmatch(str(path))
     inside = named and data is None and not path.exists()
     path, key = (Path(named[1]), named[2]) if named and inside else (path, None)
-    kind = _kind(path) if data is None else kind_of_start(data[:8])
+    kind = _kind(path) if data is None else kind_of_start(data[:8], path.suffix)
     if not kind:
         raise CaptureFileError(f"{path}: is no image that can be read; {_UNDAMAGED}")
     readers: dict[str, Any] = {

@@ -210,7 +210,8 @@ def scores_table(scores: Sequence[MethodSummary], brief: bool = False) -> Table:
         "residual": (4, [one.residual and one.residual.mean for one in scores]),
         "seconds": (2, [one.seconds for one in scores]),
     }
-    for name in ("images", "failed", "median", "best") if brief else ():
+    alone = ("beside\nthe first",) if len(scores) == 1 else ()
+    for name in (*alone, *(("images", "failed", "median", "best") if brief else ())):
         del columns[name]
     digits, cells = zip(*columns.values(), strict=True)
     return Table(tuple(columns), list(zip(*cells, strict=True)), digits=digits[1:])
