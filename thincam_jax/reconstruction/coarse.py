@@ -14,12 +14,12 @@ a convolution with every s-th sample of the PSF, filtered along both axes with a
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.grids import block_mean, block_sum
+from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import window_shape
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one
@@ -66,7 +66,7 @@ def finer(image: Image, shape: tuple[int, int]) -> Float[Array, "..."]:
     return jnp.asarray(fine[..., : shape[0], : shape[1]])
 
 
-@functools.partial(jax.jit, static_argnames="size")
+@functools.partial(quickly_compiled, static_argnames="size")
 def _coarser(
     problem: InverseProblem, operators: tuple[CropConvolution, ...], image: Image, size: int
 ):

@@ -19,6 +19,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
+from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.reconstruction.regularisers import Image
 
 Method_State = TypeVar("Method_State")
@@ -262,7 +263,7 @@ def _is_still(history: Sequence[Progress], before: Image, after: Image, share: f
     return moved <= share * size and abs(last - first) <= share / 2 * abs(last)
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _start(method: OptimistixMethod, image) -> SolverState:
     value = method.value_of(image)
     structure, nothing = jax.eval_shape(method.function, value, method.arguments)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.precision import product
+from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Stacked
 from thincam_jax.imaging.operators.base import is_shape
 from thincam_jax.imaging.operators.masked import Scaled
@@ -144,7 +145,7 @@ class InverseProblem(eqx.Module):
         return (*leading, planes, *self.field_shape)
 
 
-@jax.jit
+@quickly_compiled
 def backprojected_noise(
     operators: Sequence[AbstractOperator], weights: Sequence[Float[Array, "..."]]
 ) -> Float[Array, ""]:
@@ -351,10 +352,10 @@ def scene_level(
     return jnp.minimum(level, uniform_level(problem, has_background=False))
 
 
-compiled_level = jax.jit(scene_level)
+compiled_level = quickly_compiled(scene_level)
 
 
-@jax.jit
+@quickly_compiled
 def uniform_image(problem: InverseProblem) -> Image:
     """The non-negative uniform image that explains the captures best, a good start image."""
     level = jnp.maximum(scene_level(problem), 0)[..., None, None, None]

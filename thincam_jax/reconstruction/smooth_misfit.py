@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators.crop_convolution import place
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one, residuals
 from thincam_jax.reconstruction.regularisers import Image
@@ -83,7 +84,7 @@ def misfit_of(problem: InverseProblem, image: Image) -> Misfit | None:
     return Misfit(float(max(whole)), tuple(float(s) for s in smooth))
 
 
-@jax.jit
+@quickly_compiled
 def _ratios(problem: InverseProblem, image: Image, transfer, norm) -> tuple[list, list]:
     operators, whole, smooth = convolutions(problem) or (), [], []
     for operator, weight, left in zip(

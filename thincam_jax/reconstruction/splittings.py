@@ -35,6 +35,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex, scaled, squared_modulus
+from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.reconstruction.admm import (
@@ -195,7 +196,7 @@ class FourierSplitting(AbstractSplitting):
         return State(data, differences(image, self.variation.depth_weight), image)
 
 
-@jax.jit
+@quickly_compiled
 def _units(problem: InverseProblem, operators, variation: TotalVariation):
     """The fields of a splitting, without its operators."""
     stop = jax.lax.stop_gradient
@@ -212,7 +213,7 @@ def _units(problem: InverseProblem, operators, variation: TotalVariation):
     return gains, captures, weights, tau, normal, capture_unit / operator_unit
 
 
-@jax.jit
+@quickly_compiled
 def _default_penalties(operators, gains) -> Penalties:
     r"""Penalties that suit the operators' spectrum, by rules of thumb.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
@@ -132,7 +133,7 @@ def objective_with_uniform_light(problem: InverseProblem, image: Image) -> Float
     return compiled_objective(problem, with_uniform_light(problem, image))
 
 
-@jax.jit
+@quickly_compiled
 def _biases(operators: tuple[CropConvolution, ...]) -> list[Float[Array, ""]]:
     uniform = [jnp.max(jnp.abs(o.spectrum[..., 0, 0])) for o in operators]
     return [u / jnp.sqrt(or_one(o.mean_power())) for u, o in zip(uniform, operators, strict=True)]
