@@ -104,6 +104,7 @@ def named_tuples(modules: list[Module]) -> list[str]:
 MANY_PARAMETERS = {
     "_core/quantity.py": ("quantity",),  # the words that declare one field
     "commands/reconstruct/command.py": ("reconstruct", "check"),  # the options of the command
+    "commands/evaluate/command.py": ("evaluate",),
     "commands/sweep/command.py": ("sweep",),
     "hardware/virtual/usb3_vision.py": ("ctrl_transfer",),  # a backend of pyusb
     "reconstruction/admm.py": ("init", "postprocess"),  # a solver of optimistix

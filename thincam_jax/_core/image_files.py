@@ -56,10 +56,14 @@ def kind_of(path: str | os.PathLike[str]) -> str | None:
     "" of a file that ends within these bytes, None of others.
     """
     with open_regular(path) as (file, _):
-        start = file.read(8)
+        return kind_of_start(file.read(8), Path(path).suffix)
+
+
+def kind_of_start(start: bytes, suffix: str = "") -> str | None:
+    """`kind_of` by the first 8 bytes, and the suffix of the name."""
     if any(one.startswith(start) and one != start for one in _STARTS):
         return ""
-    if Path(path).suffix.lower() in RAW_SUFFIXES:
+    if suffix.lower() in RAW_SUFFIXES:
         return "raw"
     return next((kind for one, kind in _STARTS.items() if start.startswith(one)), None)
 
@@ -71,25 +75,29 @@ def read_whole(path: str | os.PathLike[str], kind: str | None) -> bytes:
     or an image larger than its file; ValueError and others for one with parts missing.
     """
     with open_regular(path) as (file, size):
-        most = _LARGEST
-        if kind in _SIZES:
-            pixels, held = _SIZES[kind](file)
-            if held > _DENSEST * size:
-                raise ImageFileError(
-                    f"announces {held} bytes of pixels, more than its {size} can hold: it is "
-                    "damaged"
-                )
-            if pixels > _MOST_PIXELS and size < held:
-                raise ImageFileError(
-                    f"announces {pixels} packed pixels, at most {_MOST_PIXELS} are read; save it "
-                    "without compression, or a smaller one"
-                )
-            refuse_if_too_large("its image", held, "give a smaller one")
-            most = 4 * held + _BESIDE
-        if size > most:
-            raise ImageFileError(f"holds {size} bytes, more than its image needs: it is damaged")
-        file.seek(0)
-        data = file.read(size)
+        return whole_of(file, size, kind)
+
+
+def whole_of(file: Any, size: int, kind: str | None) -> bytes:
+    """`read_whole` of an open file of `size` bytes, or of what was read before."""
+    most = _LARGEST
+    if kind in _SIZES:
+        pixels, held = _SIZES[kind](file)
+        if held > _DENSEST * size:
+            raise ImageFileError(
+                f"announces {held} bytes of pixels, more than its {size} can hold: it is damaged"
+            )
+        if pixels > _MOST_PIXELS and size < held:
+            raise ImageFileError(
+                f"announces {pixels} packed pixels, at most {_MOST_PIXELS} are read; save it "
+                "without compression, or a smaller one"
+            )
+        refuse_if_too_large("its image", held, "give a smaller one")
+        most = 4 * held + _BESIDE
+    if size > most:
+        raise ImageFileError(f"holds {size} bytes, more than its image needs: it is damaged")
+    file.seek(0)
+    data = file.read(size)
     _CHECKS.get(kind, len)(data)
     return data
 

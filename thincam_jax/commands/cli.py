@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from thincam_jax._core.program_cache import cache_state, keep_programs
 from thincam_jax.commands import terminal
+from thincam_jax.commands.evaluate.command import evaluate, info
 from thincam_jax.commands.kinds import commands_of_rooms, has_room, init, load_experiment
 from thincam_jax.commands.plate import plate
 from thincam_jax.commands.reconstruct.command import check, examine, reconstruct
@@ -24,7 +25,7 @@ from thincam_jax.commands.terminal import reported, say, say_result
 
 ORDER = (
     *("init", "explain", "explore", "run", "preview", "capture", "examine", "reconstruct"),
-    *("calibrate", "sweep", "design", "plate", "train", "schema", "doctor"),
+    *("calibrate", "dataset", "evaluate", "sweep", "design", "plate", "train", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -38,6 +39,7 @@ GROUPS = {
     "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
     "Image": ("field", "flip", "linear", "gamma", "white_balance"),
 }
+_COMPARISON = {"Comparison": ("truth", "truth_area", "fit", "shift", "published")}
 
 
 class InOrder(TyperGroup):
@@ -96,8 +98,9 @@ class Grouped(Once):
         return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        group_of = {name: group for group, names in GROUPS.items() for name in names}
-        rows: dict[str, list] = {"Options": [], **{group: [] for group in GROUPS}}
+        groups = GROUPS | _COMPARISON
+        group_of = {name: group for group, names in groups.items() for name in names}
+        rows: dict[str, list] = {"Options": [], **{group: [] for group in groups}}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record is not None:
@@ -114,6 +117,8 @@ app = typer.Typer(
 # The callback keeps the name of a single command.
 calibrate = typer.Typer(no_args_is_help=True, help="Check a calibration by captures.")
 calibrate.callback()(lambda: None)
+dataset = typer.Typer(no_args_is_help=True, help="Look at a data set of captures and truths.")
+dataset.callback()(lambda: None)
 for group, command, *examples in (
     (app, init, "init study", "init design --sensor 1500x2000 --pitch 3.45um --out mine.yaml"),
     (app, schema, "schema study > study.schema.json"),
@@ -130,6 +135,11 @@ for group, command, *examples in (
         "sweep study.yaml --grid seed=0:4:5",
         'sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
     ),
+    (
+        *(app, evaluate, "evaluate DATASET --method admm-tv --method ridge --limit 100"),
+        "evaluate DATASET --split test --fit maximum --truth linear --out runs/comparison",
+    ),
+    (dataset, info, "dataset info DATASET"),
     (app, design, "design design.yaml", "design design.yaml --out found"),
     (
         *(app, plate),
@@ -140,11 +150,12 @@ for group, command, *examples in (
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
     *((app, *one) for one in commands_of_rooms()),
 ):
-    layout = Grouped if command in (reconstruct, check) else Once
+    layout = Grouped if command in (reconstruct, check, evaluate) else Once
     printing = command if command is schema else with_output(command)  # a schema is JSON
     told_last = "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in examples)])
     group.command(cls=layout, epilog=told_last)(printing)
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(dataset, name="dataset")
 
 
 def _print_version(asked: bool) -> bool:

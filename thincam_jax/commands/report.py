@@ -70,7 +70,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """A report: what stands before the first part, the parts, and the command that made it.
+    """A report: what stands before the first part, the parts, and the command that takes its file.
 
     Between back quotes texts are code; empty texts, tables and parts are left out.
 

@@ -184,7 +184,8 @@ def show(table: "Table") -> None:
     several = any("\n" in cell for row in rows for cell in row)
     shown = Lines(title=title, title_justify="left", show_lines=several)
     for column, heading in enumerate(table.headings):
-        shown.add_column(Text(escaped(heading)), justify="right" if column else "left")
+        left = not column or column in table.words
+        shown.add_column(Text(escaped(heading)), justify="left" if left else "right")
     for row in rows:
         shown.add_row(*(Text(escaped(cell)) for cell in row))
     rich.print(shown)

@@ -23,11 +23,13 @@ from thincam_jax._core.image_files import (
     RAW_SUFFIXES,
     ImageFileError,
     kind_of,
+    kind_of_start,
     npy_header,
     png_header,
     rawpy,
     read_whole,
     tiff_pages,
+    whole_of,
 )
 from thincam_jax.imaging.encoding import ORIENTATION, upright
 from thincam_jax.measured.bayer import PATTERNS, turned_pattern
@@ -82,6 +84,15 @@ def read_image(path: str | os.PathLike[str], *, bits: int | None = None) -> Raw:
     """
     (pixels,), kind, facts = _decode(Path(path))
     return _raw(pixels, bits, kind, str(path), facts)
+
+
+def read_photograph(data: bytes, name: str, bits: int | None = None) -> Raw:
+    """Read an image from the bytes of its file, as `read_image` does.
+
+    Codes of photographs are no counts: of a JPEG nothing is said. `name`: name in messages.
+    """
+    (pixels,), kind, facts = _decode(Path(name), data=data)
+    return _raw(pixels, bits, kind, name, facts)
 
 
 @checked
@@ -170,7 +181,7 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
         raise CaptureFileError(
             f"{folder}: holds no capture; give a folder of TIFF, PNG, NPY or raw files"
         )
-    return sorted(paths, key=_order)
+    return sorted(paths, key=natural_order)
 
 
 def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
@@ -190,16 +201,25 @@ def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
     return alike or list(named.values())
 
 
-def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
+def natural_order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Key by which capture_9 comes before capture_10."""
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
 
 
-def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Facts]:
-    """Pixels of each image, format, and facts of the file; several images only of a stack."""
+def _decode(
+    path: Path, stack: bool = False, data: bytes | None = None
+) -> tuple[list[np.ndarray], str, _Facts]:
+    """Pixels of each image, format, and facts of the file; several images only of a stack.
+
+    `data`: its bytes, where they have been read; `path` is then a name.
+    """
     named = _KEYED.fullmatch(str(path))
-    path, key = (Path(named[1]), named[2]) if named and not path.exists() else (path, None)
-    kind = _kind(path)
+    inside = named and data is None and not path.exists()
+    path, key = (Path(named[1]), named[2]) if named and inside else (path, None)
+    kind = _kind(path) if data is None else kind_of_start(data[:8], path.suffix)
+    if not kind:
+        raise CaptureFileError(f"{path}: is no image that can be read; {_UNDAMAGED}")
     readers: dict[str, Any] = {
         **{one: partial(_read_container, one, key) for one in OPENERS},
         "pgm": read_pgm,
@@ -211,7 +231,8 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Fa
     }
     try:
         with _silence():
-            images, facts = readers[kind](read_whole(path, kind))
+            whole = data and whole_of(io.BytesIO(data), len(data), kind)
+            images, facts = readers[kind](whole or read_whole(path, kind))
     except (CaptureFileError, ImageFileError) as error:
         raise CaptureFileError(f"{path}: {error}") from None
     except Exception as error:  # each decoder raises its own kind
@@ -222,7 +243,7 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, _Fa
         raise CaptureFileError(
             f"{path}: cannot be read as {kind.upper()} ({reason}); {advice}"
         ) from None
-    if kind == "jpeg":
+    if kind == "jpeg" and data is None:
         warnings.warn(f"{path}: {_NONLINEAR}", NonlinearWarning, stacklevel=3)
     return images, kind, facts
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -135,7 +136,7 @@ def sure_tau(
     low, high = (math.log(own * factor) for factor in span)
     import scipy.optimize  # here, since it takes a tenth of a second
 
-    found = scipy.optimize.minimize_scalar(
+    found: Any = scipy.optimize.minimize_scalar(
         criterion, bounds=(low, high), method="bounded", options={"maxiter": solves}
     )
     best = with_tau(problem, math.exp(found.x))

@@ -280,12 +280,24 @@ def read_corner(text: str) -> tuple[int, int]:
     return first, last
 
 
-def read_crop(text: str | None) -> tuple[tuple[int, int], tuple[int, int]] | None:
+def resolved(background: str | None) -> str | None:
+    """A background with the whole path of its file; MeasurementError for a folder."""
+    given = read_background(background)
+    if not isinstance(given, Path):
+        return background
+    if given.is_dir():
+        raise MeasurementError(f"{given}: is a folder; give one background for all captures")
+    return str(given.resolve())
+
+
+def read_crop(
+    text: str | None, option: str = "--crop"
+) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """The rows and the columns of the captures to use, from "100:740,200:1000"."""
     if text is None:
         return None
     advice = "give the first row and the one after the last, and the columns, as 100:740,200:1000"
-    with read_as(f"--crop {text}", advice):
+    with read_as(f"{option} {text}", advice):
         rows, columns = text.split(",")
         return read_corner(rows), read_corner(columns)
 

@@ -58,7 +58,7 @@ def sweep(
         return f"interrupted; {kept}. The same command goes on from there."
 
     with reported(interrupted):
-        _check(scheduler, workers)
+        check_workers("sweep", scheduler, workers, _SCHEDULER_PARTS if scheduler else _PARTS)
         from thincam_jax._core.precision import is_double
         from thincam_jax.commands import run
         from thincam_jax.commands.kinds import load_study
@@ -87,14 +87,16 @@ def sweep(
     _print(swept, folder.path)
 
 
-def _check(scheduler: str | None, workers: int | None) -> None:
+def check_workers(
+    command: str, scheduler: str | None, workers: int | None, parts: tuple[str, ...]
+) -> None:
+    """Refuse numbers of workers, and libraries that are missing. **Errors**: ConfigError."""
     from thincam_jax.commands.config_file import ConfigError
 
-    parts = _SCHEDULER_PARTS if scheduler else _PARTS
     missing = [name for name in parts if find_spec(name) is None]
     if missing:
         raise ConfigError(
-            f"thincam sweep needs {', '.join(missing)}; install them with "
+            f"thincam {command} needs {', '.join(missing)}; install them with "
             "pip install 'thincam_jax[sweep]'"
         )
     if workers is not None and workers < 1:

@@ -176,7 +176,7 @@ def run_sweep(
             local = scheduler is None
             work = local_workers(workers, len(runnable)) if local else scheduled_workers(scheduler)
             with work as outcomes:
-                for key, result in _tried_twice(outcomes, measure, runnable):
+                for key, result in tried_twice(outcomes, measure, runnable):
                     keep(todo[key], _outcome(result))
     finally:
         table, failures = folder.collect(points)
@@ -186,7 +186,7 @@ def run_sweep(
     return Swept(len(points), table.num_rows, failures, best)
 
 
-def _tried_twice(
+def tried_twice(
     outcomes: Outcomes, measure: Callable, tasks: Mapping[str, tuple]
 ) -> Iterator[tuple[str, Any]]:
     """A task whose worker died is done once more when no other is under way.
