@@ -65,7 +65,7 @@ def test_schemas_of_the_shipped_files_are_those_of_the_command(kind):
 
 
 DESIGNS = [path.stem for path in FILES if path.stem.startswith("design")]
-STUDIES = ("flatcam", "fza_admm_tv", "fza_harmonics", "moving", "mura")
+STUDIES = ("flatcam", "fza_admm_tv", "fza_harmonics", "fza_slm_chart", "moving", "mura")
 
 
 def but(*slow):

@@ -24,7 +24,7 @@ def file(tmp_path, monkeypatch):
     return tiny.write(tmp_path, yaml.safe_dump(MOSAIC))
 
 
-@pytest.mark.parametrize("wall", ["0.1 mm", "null"])
+@pytest.mark.parametrize("wall", ["0.1 mm", pytest.param("null", marks=pytest.mark.thorough)])
 def test_one_frame_holds_all_captures(wall, file, tmp_path):
     """The rig's optics know pixels and walls, not parts; what differs is noise."""
     store, out = tmp_path / "a.zarr", tmp_path / "out"
