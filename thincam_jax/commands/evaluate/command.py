@@ -11,12 +11,21 @@ from thincam_jax.commands.reconstruct.command import (
     Background,
     Bayer,
     Bits,
+    Blocks,
     Corner,
+    Coupling,
     Dead,
+    Demosaicing,
+    Iterations,
+    Noise,
     PsfBackground,
     PsfBits,
     PsfScale,
+    Ridge,
+    Saturation,
     Strict,
+    Tau,
+    Threshold,
 )
 from thincam_jax.commands.sweep.command import Scheduler, Workers, check_workers
 from thincam_jax.commands.terminal import (
@@ -75,42 +84,21 @@ def evaluate(
     bits: Bits = None,
     psf_bits: PsfBits = None,
     bayer: Bayer = None,
-    demosaic: Annotated[
-        Literal["bilinear", "superpixel"],
-        Option(help="bilinear: all pixels; superpixel: joins 2×2 pixels to one, at half the size."),
-    ] = "bilinear",
-    downsample: Annotated[int, Option(help="Average blocks of so many pixels a side.")] = 1,
+    demosaic: Demosaicing = "bilinear",
+    downsample: Blocks = 1,
     corner: Corner = "5:15",
     psf_scale: PsfScale = None,
     psf_channels: Annotated[
         Literal["each", "mean"] | None,
         Option(help="each: one PSF for each colour; mean: their mean. Default: as published."),
     ] = None,
-    saturation: Annotated[
-        float | None, Option(help="Pixels from this part of full scale on count as saturated.")
-    ] = None,
-    noise_threshold: Annotated[
-        float | None, Option(help="Set the PSF to zero below so many times its noise.")
-    ] = None,
-    tau: Annotated[
-        float | None,
-        Option(help="Weight of total variation relative to the noise, about 1 to 3. Default: 2."),
-    ] = None,
-    ridge: Annotated[
-        float | None,
-        Option(help="Weight of the penalty of ridge, relative to the expected one. Default: 1."),
-    ] = None,
-    coupling: Annotated[
-        Literal["none", "joint", "opponent"] | None,
-        Option(help="How total variation joins colours. Default: joint."),
-    ] = None,
-    iterations: Annotated[
-        int | None, Option(help="Most iterations. Default: 300; fista 100, pnp 5, ridge 1000.")
-    ] = None,
-    noise: Annotated[
-        float | None,
-        Option(help="Standard deviation of a raw pixel's noise, counts. Default: estimated."),
-    ] = None,
+    saturation: Saturation = None,
+    noise_threshold: Threshold = None,
+    tau: Tau = None,
+    ridge: Ridge = None,
+    coupling: Coupling = None,
+    iterations: Iterations = None,
+    noise: Noise = None,
     strict: Strict = False,
     truth: Truth = None,
     truth_area: Area = None,

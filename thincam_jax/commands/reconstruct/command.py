@@ -43,6 +43,36 @@ Bayer = Annotated[
 ]
 Strict = Annotated[bool, Option("--strict", help="End with exit code 2 at a severe finding.")]
 Dead = Annotated[Path | None, Option(help="Image that marks dead pixels by any value but zero.")]
+Demosaicing = Annotated[
+    Literal["bilinear", "superpixel"],
+    Option(help="bilinear: all pixels; superpixel: joins 2×2 pixels to one, at half the size."),
+]
+Blocks = Annotated[int, Option(help="Average blocks of so many pixels a side.")]
+Saturation = Annotated[
+    float | None, Option(help="Pixels from this part of full scale on count as saturated.")
+]
+Threshold = Annotated[
+    float | None, Option(help="Set the PSF to zero below so many times its noise.")
+]
+Tau = Annotated[
+    float | None,
+    Option(help="Weight of total variation relative to the noise, about 1 to 3. Default: 2."),
+]
+Ridge = Annotated[
+    float | None,
+    Option(help="Weight of the penalty of ridge, relative to the expected one. Default: 1."),
+]
+Coupling = Annotated[
+    Literal["none", "joint", "opponent"] | None,
+    Option(help="How total variation joins colours. Default: joint."),
+]
+Iterations = Annotated[
+    int | None, Option(help="Most iterations. Default: 300; fista 100, pnp 5, ridge 1000.")
+]
+Noise = Annotated[
+    float | None,
+    Option(help="Standard deviation of a raw pixel's noise, counts. Default: estimated."),
+]
 
 
 def reconstruct(
@@ -85,24 +115,17 @@ def reconstruct(
     set_: Overrides = None,
     background: Background = None,
     psf_background: PsfBackground = None,
-    downsample: Annotated[int, Option(help="Average blocks of so many pixels a side.")] = 1,
+    downsample: Blocks = 1,
     bits: Bits = None,
     psf_bits: PsfBits = None,
     corner: Corner = "5:15",
     psf_scale: PsfScale = None,
     crop: Crop = None,
     bayer: Bayer = None,
-    demosaic: Annotated[
-        Literal["bilinear", "superpixel"],
-        Option(help="bilinear: all pixels; superpixel: joins 2×2 pixels to one, at half the size."),
-    ] = "bilinear",
+    demosaic: Demosaicing = "bilinear",
     dead: Dead = None,
-    saturation: Annotated[
-        float | None, Option(help="Pixels from this part of full scale on count as saturated.")
-    ] = None,
-    noise_threshold: Annotated[
-        float | None, Option(help="Set the PSF to zero below so many times its noise.")
-    ] = None,
+    saturation: Saturation = None,
+    noise_threshold: Threshold = None,
     psf_channels: PsfChannels = "each",
     method: Annotated[
         str,
@@ -110,25 +133,11 @@ def reconstruct(
             help=f"Reconstruction method: {', '.join(METHODS)}.", autocompletion=lambda: METHODS
         ),
     ] = "admm-tv",
-    tau: Annotated[
-        float | None,
-        Option(help="Weight of total variation relative to the noise, about 1 to 3. Default: 2."),
-    ] = None,
-    ridge: Annotated[
-        float | None,
-        Option(help="Weight of the penalty of ridge, relative to the expected one. Default: 1."),
-    ] = None,
-    noise: Annotated[
-        float | None,
-        Option(help="Standard deviation of a raw pixel's noise, counts. Default: estimated."),
-    ] = None,
-    iterations: Annotated[
-        int | None, Option(help="Most iterations. Default: 300; fista 100, pnp 5, ridge 1000.")
-    ] = None,
-    coupling: Annotated[
-        Literal["none", "joint", "opponent"] | None,
-        Option(help="How total variation joins colours. Default: joint."),
-    ] = None,
+    tau: Tau = None,
+    ridge: Ridge = None,
+    noise: Noise = None,
+    iterations: Iterations = None,
+    coupling: Coupling = None,
     field: Annotated[
         Literal["sensor", "full"],
         Option(
