@@ -61,6 +61,7 @@ def test_captures_share_the_exposure():
     assert errors["some"][1] > 1.01 * errors["some"][0]
 
 
+@pytest.mark.thorough
 def test_frequencies_stay_few_however_many_fringes_a_sensor_has():
     """Close at zero, farther apart above: the errors of even samples, to 0.01 dB."""
     space = DesignSpace(small.pairs(), (small.shared("width", 2.0, 120.0, 0),))

@@ -98,6 +98,7 @@ def test_the_first_image_is_denoised_with_the_noise_that_was_found():
     assert abs(first[SIGMA / 2] / first[SIGMA] / 2 - 1) < 0.2
 
 
+@pytest.mark.thorough
 def test_captures_of_little_noise_are_solved_in_single_precision():
     """At 52 dB, most of a PSF beside the sensor: without a least shift the image exploded."""
     y, x = np.indices((63, 63)) - 31

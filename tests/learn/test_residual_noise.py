@@ -83,6 +83,7 @@ def test_a_capture_of_more_light_keeps_its_own_noise():
         np.testing.assert_allclose(float(found.mean()), 1, atol=0.1)
 
 
+@pytest.mark.thorough
 def test_in_the_light_of_a_hundred_electrons_it_beats_total_variation_by_a_decibel():
     """At its best τ of 0.5, 1, 2, 4. With one variance for all pixels it gains 0.4 dB."""
     A, truth = zone_aperture(), scene()
@@ -110,6 +111,7 @@ def test_the_noise_is_that_of_the_noisiest_part():
     assert not noise.grows
 
 
+@pytest.mark.thorough
 def test_the_noise_of_enlarged_captures_is_found():
     """Captures of two distances, one of them interpolated; all frequencies would say 0.8."""
     rng, sensor = np.random.default_rng(5), tc.Sensor((64, 72), 0.04)

@@ -118,6 +118,7 @@ def test_a_point_casts_each_mask_where_straight_lines_go(wall):
     assert not wall or float(jnp.sum(frame[:, 34:37])) == 0.0  # under the wall
 
 
+@pytest.mark.thorough
 def test_a_place_is_a_point_beside_the_axis():
     camera = tc.LenslessCamera(plate(), SENSOR, DISTANCE)
     aside = camera.replace(place=(0.3, -0.4))
@@ -153,7 +154,9 @@ def test_spacers_change_the_distance_of_each():
     assert distances == [4.0, 4.5, 4.0, 5.0]
 
 
-@pytest.mark.parametrize("what", ["beta", "phase", "spacer"])
+@pytest.mark.parametrize(
+    "what", ["phase", *(pytest.param(w, marks=pytest.mark.thorough) for w in ("beta", "spacer"))]
+)
 def test_gradients_are_those_of_finite_differences(what):
     weights = jnp.asarray(np.random.default_rng(1).normal(size=SENSOR.shape))
 

@@ -56,6 +56,7 @@ def test_captures_have_the_noise_that_they_say(lesson):
     assert np.any(power > 0.8 * np.asarray(lesson.variance))
 
 
+@pytest.mark.thorough
 def test_lessons_take_the_steps_of_plug_and_play(lesson):
     """With the shipped network. The solver corrects the noise given; lessons take it as it is."""
     denoiser = learn.Denoiser()

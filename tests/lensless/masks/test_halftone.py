@@ -25,6 +25,7 @@ def test_open_fraction_is_the_grey_level(density, power):
     assert abs(found.mean() - wanted.mean()) < 0.01
 
 
+@pytest.mark.thorough
 def test_finer_cells_have_the_psf_of_the_grey_mask():
     sensor = tc.Sensor((30, 40), 20 * um)
 

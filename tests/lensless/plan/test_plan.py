@@ -182,6 +182,7 @@ def test_odd_scenes_stay_within_their_prediction(name, tolerance):
     assert true <= plan.predicted_error <= tolerance
 
 
+@pytest.mark.thorough
 def test_a_plan_notices_other_light_and_larger_planes():
     few = scene(2, 3)
     plan = tc.plan_capture(camera(), few, tolerance=0.1)
