@@ -18,8 +18,14 @@ from thincam_jax.commands.evaluate.config import EvaluationConfig
 from thincam_jax.commands.evaluate.pair import Scored, key_of, opened, score_pair
 from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder, digest, read_entries, to_json
-from thincam_jax.commands.sweep.run import Progress, tried_twice
-from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
+from thincam_jax.commands.sweep.workers import (
+    Died,
+    Outcomes,
+    Progress,
+    local_workers,
+    scheduled_workers,
+    tried_twice,
+)
 from thincam_jax.measured.pairs import Pairs
 from thincam_jax.studies.agreement import MethodSummary, summarised
 
@@ -124,9 +130,10 @@ def run_evaluation(
     todo = [task for task in tasks if not _is_done(folder, text, task, double)]
     done, failed = len(tasks) - len(todo), 0
     progress(done, failed)
-    address = work.scheduler
-    local = local_workers(work.workers, len(tasks)) if address is None else None
-    with local or scheduled_workers(address or "") as outcomes:
+    count, address = len(tasks), work.scheduler
+    local = address is None
+    workers = local_workers(work.workers, count) if local else scheduled_workers(address)
+    with workers as outcomes:
         for task, scored in _scored(outcomes, text, todo, double):
             done, failed = done + 1, failed + (scored.reason is not None)
             folder.keep(task.file, scored)

@@ -1,7 +1,7 @@
 """Running a sweep: the points that its folder does not hold yet, and the tables of them."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,16 @@ from pyarrow import csv
 from thincam_jax._core.files import write_whole
 from thincam_jax.commands.run_folder import RunFolder, read_entries
 from thincam_jax.commands.sweep.point import GridPoint, Metrics, described, measure_point, one_line
-from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
+from thincam_jax.commands.sweep.workers import (
+    Died,
+    Progress,
+    local_workers,
+    scheduled_workers,
+    tried_twice,
+)
 
 _PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
 _MEASURE = "mean_psnr_db/"  # of each method, over all targets
-Progress = Callable[[int, int], object]
 
 
 class SweepFolder(RunFolder):
@@ -184,23 +189,6 @@ def run_sweep(
         return Swept(len(points), 0, failures)
     best = summarise(folder.path, table, list(points[0].values))
     return Swept(len(points), table.num_rows, failures, best)
-
-
-def tried_twice(
-    outcomes: Outcomes, measure: Callable, tasks: Mapping[str, tuple]
-) -> Iterator[tuple[str, Any]]:
-    """A task whose worker died is done once more when no other is under way.
-
-    If that dies too, the death is the task's own: not of a memory that others had filled.
-    """
-    suspects = []
-    for name, result in outcomes(measure, tasks):
-        if isinstance(result, Died):
-            suspects.append(name)
-        else:
-            yield name, result
-    for name in suspects:
-        yield from outcomes(measure, {name: tasks[name]})
 
 
 def _outcome(result: Any) -> Metrics:

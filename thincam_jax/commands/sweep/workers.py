@@ -28,8 +28,29 @@ _CONNECT_SECONDS = 5  # to a scheduler
 Outcomes = Callable[[Callable, Mapping[str, tuple]], Iterator[tuple[str, Any]]]
 
 
+# Called with the numbers of tasks that have ended and that have failed.
+Progress = Callable[[int, int], object]
+
+
 class Died:
     """Placeholder for a result whose worker process ended while it computed."""
+
+
+def tried_twice(
+    outcomes: Outcomes, measure: Callable, tasks: Mapping[str, tuple]
+) -> Iterator[tuple[str, Any]]:
+    """A task whose worker died is done once more when no other is under way.
+
+    If that dies too, the death is the task's own: not of a memory that others had filled.
+    """
+    suspects = []
+    for name, result in outcomes(measure, tasks):
+        if isinstance(result, Died):
+            suspects.append(name)
+        else:
+            yield name, result
+    for name in suspects:
+        yield from outcomes(measure, {name: tasks[name]})
 
 
 @contextlib.contextmanager
