@@ -172,7 +172,7 @@ def field_operator(
 
 def field_fit(
     camera: LenslessCamera,
-    colours: Sequence[tuple[Number, Float[Array, ""] | float]],
+    colours: Sequence[tuple[Number, Number]],
     object_distance: Number,
     field_shape: tuple[int, int],
     method: PsfMethod,

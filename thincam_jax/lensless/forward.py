@@ -60,7 +60,7 @@ def imaging_operator(
 
 def operator_of(
     camera: LenslessCamera,
-    colours: Sequence[tuple[Number, Float[Array, ""] | float]],
+    colours: Sequence[tuple[Number, Number]],
     object_distance: Number,
     field_shape: tuple[int, int],
     method: PsfMethod,

@@ -119,7 +119,7 @@ def psf_about_ray(
 
 def spectral_psf(
     camera: LenslessCamera,
-    light: Iterable[tuple[Number, Float[Array, ""] | float]],
+    light: Iterable[tuple[Number, Number]],
     object_distance: Number,
     method: PsfMethod,
     grid: Grid,
@@ -130,7 +130,7 @@ def spectral_psf(
     parts = []
     for wavelength, weight in light:
         h = psf_about_ray(own, wavelength, object_distance, at, method)
-        is_whole = not checks.is_traced(weight) and float(weight) == 1
+        is_whole = not checks.is_traced(weight) and bool(np.asarray(weight) == 1)
         parts.append(h if is_whole else weight * h)  # of one colour nothing to compile
     return functools.reduce(operator.add, parts)
 
