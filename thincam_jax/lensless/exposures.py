@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,6 +29,9 @@ from thincam_jax.lensless.mosaic import Mosaic
 # method B (Eq 3.49).
 QUARTERS = (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)
 PAIR = (0.0, 3 * math.pi / 2)
+
+# Numbers and profiles of each exposure.
+_SETTINGS = ("beta", "distance", "phase", "wavelength", "width", "relative_time", "profile")
 
 # What a row holds: plain numbers, or elements of the arrays while gradients pass.
 if TYPE_CHECKING:
@@ -257,6 +260,16 @@ class Exposures(Module):
             ends,
             centre=centre,
         )
+
+    @classmethod
+    def of(cls, rows: Iterable[Exposure]) -> "Exposures":
+        """Exposures one after another, with the settings of single ones; takes are counted anew."""
+        rows = tuple(rows)
+        given: dict[str, Any] = {n: [getattr(one, n) for one in rows] for n in _SETTINGS}
+        for name in ("moves", "centre"):
+            pairs = [getattr(one, name) for one in rows]
+            given[name] = pairs if any(pairs) else None
+        return cls(**given)
 
     def cameras(self, sensor: Sensor, mask: AbstractMask | None = None) -> list[LenslessCamera]:
         """The camera of each exposure; equal in all but what the exposures differ in.

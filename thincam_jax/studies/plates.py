@@ -49,11 +49,7 @@ def compare_plates(
         return PlateComparison(error)
     scores = []
     for name, one in (("grey", mask), ("plate", plate)):
-        alone = Exposures(
-            exposure.beta, exposure.distance, phase=exposure.phase, width=exposure.width,
-            wavelength=exposure.wavelength, relative_time=exposure.relative_time,
-            profile=exposure.profile
-        )  # fmt: skip
+        alone = Exposures.of([replace(exposure, moves=None)])
         method = Method(name, alone, AdmmTV())
         made = replace(study, mask=one, methods=(method,), targets=())
         captures = {alone[0]: take(made, alone[0], seen[0])}

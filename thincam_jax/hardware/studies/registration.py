@@ -142,22 +142,8 @@ def _place(study: Study, first: Exposure, shot: Exposure, image, reference) -> S
 def _alone(method: Method, taken: slice, number: int) -> Method:
     """The method of one shot, by a Wiener filter."""
     rows = tuple(method.exposures)[taken]
-    alone = _of_rows(rows, [one.distance for one in rows])
-    return replace(method, name=f"{method.name}, shot {number}", exposures=alone, solver=Wiener())
-
-
-def _of_rows(
-    rows: Sequence[Exposure], distance: list[float], centre: list[tuple[float, float]] | None = None
-) -> Exposures:
-    return Exposures(
-        [one.beta for one in rows],
-        distance,
-        phase=[one.phase for one in rows],
-        wavelength=[one.wavelength for one in rows],
-        width=[one.width for one in rows],
-        profile=[one.profile for one in rows],
-        centre=centre,
-    )
+    name, alone = f"{method.name}, shot {number}", Exposures.of(rows)
+    return replace(method, name=name, exposures=alone, solver=Wiener())
 
 
 def standing_at(study: Study, places: ShotPlaces) -> Study:
@@ -165,9 +151,12 @@ def standing_at(study: Study, places: ShotPlaces) -> Study:
     methods = []
     for method in study.methods:
         each = [place for place in places.shots for _ in range(method.phases)]
-        centres = [one.centre for one in each]
-        moved = [one.distance for one in each], centres if np.any(centres) else None
-        methods.append(replace(method, exposures=_of_rows(tuple(method.exposures), *moved)))
+        is_aside = np.any([place.centre for place in each])
+        rows = [
+            replace(one, distance=place.distance, centre=place.centre if is_aside else None)
+            for one, place in zip(method.exposures, each, strict=True)
+        ]
+        methods.append(replace(method, exposures=Exposures.of(rows)))
     return replace(study, methods=tuple(methods))
 
 
