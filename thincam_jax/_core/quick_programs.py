@@ -25,8 +25,7 @@ def quickly_compiled(function: _Function, static_argnames: str | tuple[str, ...]
     @functools.wraps(function)
     def call(*arguments, **named):
         is_part = holds_traced(arguments, named) or is_traced(jnp.zeros(()))
-        return (thorough if is_part or jax.default_backend() != "cpu" else quick)(
-            *arguments, **named
-        )
+        run = quick if jax.default_backend() == "cpu" and not is_part else thorough
+        return run(*arguments, **named)
 
     return cast(_Function, call)

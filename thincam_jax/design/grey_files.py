@@ -1,12 +1,9 @@
 """Grey masks as tables for grey-scale writers: 16-bit pictures with their scale."""
 
-import io
 import os
 from pathlib import Path
 
 import numpy as np
-import PIL.Image
-import tifffile
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
@@ -14,9 +11,10 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.files import write_whole
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.imaging.encoding import png_bytes
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.measured.write import log_text
+from thincam_jax.measured.write import linear_bytes, log_text
 
 _FULL = 2**16 - 1
 _OPAQUE = 5.0  # optical density of a count of 0
@@ -72,9 +70,5 @@ def write_density_map(path: str | os.PathLike[str], mask: AbstractMask, pixel: N
         "densities": np.round(-np.log10(light), 4).tolist(),
     }
     write_whole(path.with_suffix(".json"), log_text(record))
-    buffer = io.BytesIO()
-    if path.suffix.lower() == ".png":
-        PIL.Image.fromarray(counts).save(buffer, format="PNG")
-    else:
-        tifffile.imwrite(buffer, counts, photometric="minisblack")
-    return write_whole(path, buffer.getvalue())
+    is_png = path.suffix.lower() == ".png"
+    return write_whole(path, png_bytes(counts) if is_png else linear_bytes(counts[None], ".tif"))

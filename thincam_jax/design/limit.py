@@ -19,7 +19,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -103,9 +103,10 @@ def limit(problem: DesignProblem, masks: Masks = "shadow") -> Limit:
         raise TypeError(
             "a limit needs frequencies on a Quadrant; make the problem by design_problem"
         )
-    if not isinstance(data.setup.noise, PhotonNoise):
+    noise = data.setup.noise
+    if not isinstance(noise, PhotonNoise):
         raise TypeError("noise at an SNR does not know of light; give the setup PhotonNoise")
-    scene = _Scene(problem.space, data.setup, data.frequencies)
+    scene = _Scene(problem.space, data.setup, noise, data.frequencies)
     return _limit_of_shadows(scene) if masks == "shadow" else _limit_by_overlap(scene, masks)
 
 
@@ -117,7 +118,7 @@ class _Scene:
     - `gain`: η_f J is η_f·gain·|H|²/(T + dark); `dark`: light as noisy as the read noise, mm².
     """
 
-    def __init__(self, space: DesignSpace, setup: Setup, frequencies: Quadrant):
+    def __init__(self, space: DesignSpace, setup: Setup, noise: PhotonNoise, frequencies: Quadrant):
         # Bounds grow with the distance, and a shorter wavelength diffracts less.
         distance, width = space.reach("distance")[1], space.reach("width")[1]
         side = (1 + distance / float(setup.object_distance)) * width
@@ -134,9 +135,9 @@ class _Scene:
         self.total = float(np.sum(self.weight * self.spectrum))
         captures, exposure = _equal_exposures(space)
         pitch, field = float(setup.pitch), float(setup.field)
-        counted = float(setup.noise.electrons) * exposure  # pyright: ignore
+        counted = float(noise.electrons) * exposure
         seen = min(1.0, field * distance / side) ** 2
-        self.dark = float(setup.noise.read_noise) ** 2 / (counted * seen)  # pyright: ignore
+        self.dark = float(noise.read_noise) ** 2 / (counted * seen)
         self.gain = captures * counted / seen * self.solid / pitch**2
         if setup.pixel_integration:
             self.gain = self.gain * np.prod(np.sinc(pitch * along / distance) ** 2, axis=0)
@@ -196,7 +197,8 @@ def _limit_of_shadows(scene: _Scene) -> Limit:
 
 def _place_of_least(cost: Callable[[float], float], low: float, high: float) -> float:
     options = {"xatol": _TOLERANCE}
-    return float(minimize_scalar(cost, bounds=(low, high), method="bounded", options=options).x)  # pyright: ignore
+    found: Any = minimize_scalar(cost, bounds=(low, high), method="bounded", options=options)
+    return float(found.x)
 
 
 class _Filling:

@@ -109,7 +109,7 @@ def eight_bit(
 
 
 def png_bytes(pixels: np.ndarray, gamma: float | int | None = None) -> bytes:
-    """A PNG file of 8-bit grey (y, x) or RGB (y, x, 3), which says the γ of its pixels."""
+    """A PNG of 8 or 16-bit grey (y, x) or 8-bit RGB (y, x, 3), which says the γ of its pixels."""
     buffer, info = io.BytesIO(), PIL.PngImagePlugin.PngInfo()
     if gamma is not None:
         info.add(b"gAMA", struct.pack(">I", min(max(round(1e5 / gamma), 1), 2**31 - 1)))

@@ -272,9 +272,7 @@ def _parquet(path: Path, split: str | None) -> Pairs | None:
     return open_parquet(path, files, split)
 
 
-LAYOUTS: tuple[Callable[[Path, str | None], Pairs | None], ...] = (
-    *(_diffusercam, _parquet, _folders),
-)
+LAYOUTS: tuple[Callable[[Path, str | None], Pairs | None], ...] = (_diffusercam, _parquet, _folders)
 
 
 def _content(path: Path) -> str:

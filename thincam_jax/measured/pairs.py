@@ -195,12 +195,13 @@ class Pairs:
     licence: str = "not stated"
     notes: tuple[str, ...] = ()
 
-    @property
+    @functools.cached_property
     def names(self) -> Sequence[str]:
+        """Names of the pairs, listed once: a data set holds ten thousands."""
         return self.storage.names
 
     def __len__(self) -> int:
-        return len(self.storage.names)
+        return len(self.names)
 
     def __getitem__(self, number: int) -> PairedCapture:
         """A pair; MeasurementError, one line, for files that cannot be read."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from thincam_jax._core.table import Cell, Table, number
 from thincam_jax.imaging.encoding import as_picture
@@ -138,13 +138,17 @@ class Mean:
 
 
 def mean_of(values: Sequence[float | None]) -> Mean | None:
-    """Mean of those that are numbers; None where none is."""
+    """Mean of the numbers among the values; None without any."""
     known = np.asarray([value for value in values if value is not None], float)
     if len(known) < 2:
         return Mean(float(known[0]), None) if len(known) else None
-    spread = known.std(ddof=1) / np.sqrt(len(known))
-    half = scipy.stats.t.ppf(0.975, len(known) - 1) * spread
-    return Mean(float(known.mean()), float(half))
+    return Mean(float(known.mean()), half_interval(known))
+
+
+def half_interval(values: Float64[np.ndarray, " n"]) -> float:
+    """Half of the interval of 95 % of the mean of two values or more, by Student's t."""
+    error = float(np.std(values, ddof=1)) / len(values) ** 0.5
+    return float(scipy.stats.t.ppf(0.975, len(values) - 1)) * error
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Array
 
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.studies.agreement import half_interval
 from thincam_jax.studies.evaluate import (
     Evaluation,
     Resolved,
@@ -157,7 +157,7 @@ class GainOverPhotographs:
     def of(cls, values: Iterable[float]) -> "GainOverPhotographs":
         """Gain from the values on two photographs or more."""
         gains = np.array([*values])
-        half = scipy.stats.t.ppf(0.975, len(gains) - 1) * np.std(gains, ddof=1) / len(gains) ** 0.5
+        half = half_interval(gains)
         ends = (float(np.mean(gains) + side * half) for side in (0, -1, 1))
         mean, low, high = (round(end, 4) for end in ends)
         return cls(mean, low, high, tuple(round(float(gain), 4) for gain in gains))

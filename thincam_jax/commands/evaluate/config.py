@@ -1,5 +1,6 @@
 """Options of an evaluation but for its methods and the number of pairs, which may grow."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,7 +63,7 @@ class EvaluationConfig(Section):
                 upside_down=was.upside_down,
                 source="given",
             )
-        return Pairs(**{**vars(pairs), **changes})
+        return dataclasses.replace(pairs, **changes)
 
     def sources(self, psf: Path, psf_scale: float | None) -> Sources:
         """Files and preparation as of `thincam reconstruct`, for the PSF of a mask."""

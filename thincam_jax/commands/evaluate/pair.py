@@ -64,12 +64,14 @@ def score_pair(
     scores = asdict(found) | others
     scores["findings"] += [str(one.message) for one in warned]
     image, truth = scores.pop("image"), scores.pop("truth")
+    if not with_images:
+        return Scored(key, scores, seconds)
     light = np.moveaxis(np.atleast_3d(pair.capture.pixels), -1, 0).astype(np.float32)
     if pairs.alignment.turned:
         light = light[:, ::-1, ::-1]
     light = light[:, ::-1] if pairs.alignment.upside_down else light
-    images = {"capture": light, "image": image, "truth": truth} if with_images else {}
-    return Scored(key, scores, seconds, shown=images)
+    shown = {"capture": light, "image": image, "truth": truth}
+    return Scored(key, scores, seconds, shown=shown)
 
 
 def reconstructed(
@@ -77,8 +79,9 @@ def reconstructed(
 ) -> tuple[Agreement, float, dict[str, Any]]:
     """Agreement, seconds and further results, by the steps of `thincam reconstruct`."""
     asked, pairs = opened(config)
-    recipe, rig = asked.recipe(method), _rig(config, pair.mask_label, *_ratio(pair))
-    capture = pair.capture
+    capture, recipe = pair.capture, asked.recipe(method)
+    scale = None if pair.psf is None else relative_pitch(pair.psf, capture)
+    rig = _rig(config, pair.mask_label, scale)
     level: Any = pair.background or rig.background
     if isinstance(level, Raw):
         capture, level = without_hot_pixels(capture, level)
@@ -133,7 +136,3 @@ def _rig(config: str, label: int | None, psf_scale: float | None) -> Inputs:
     if psf is None:
         raise MeasurementError(f"mask {label} has no PSF; name one {label} in the folder of --psf")
     return Inputs(asked.sources(psf, psf_scale))
-
-
-def _ratio(pair: PairedCapture) -> tuple[float | None]:
-    return (None if pair.psf is None else relative_pitch(pair.psf, pair.capture),)
