@@ -136,8 +136,10 @@ def open_pairs(
 def with_psf(pairs: Pairs, psf: Path) -> Pairs:
     """Pairs with a PSF's file; or a folder of one for each mask, named by its label: mask_3.npy.
 
-    **Errors**: MeasurementError for a folder that lacks one by name.
+    **Errors**: MeasurementError for what does not exist, and a folder that lacks one by name.
     """
+    if not psf.exists():
+        raise MeasurementError(f"{psf}: does not exist; give an image, or a folder of them")
     if not psf.is_dir():
         return dataclasses.replace(pairs, psfs={None: psf})
     labels = {file: re.findall(r"\d+", file.stem)[-1:] for file in image_files(psf)}
@@ -151,7 +153,7 @@ def chosen_split(path: Path, splits: Mapping[str, int], split: str | None) -> st
     if split is None:
         return "test" if "test" in splits else "all"
     if split != "all" and split not in splits:
-        there = ", ".join(("all", *splits))
+        there = ", ".join(dict.fromkeys(("all", *splits)))
         raise MeasurementError(f"{path}: has no split {split!r}; there are {there}")
     return split
 

@@ -73,7 +73,6 @@ class TruthAlignment:
         """
         halved = log.options.bayer is not None and log.options.demosaicing == "superpixel"
         parts: list[tuple[slice, slice]] = []
-        scales: list[float] = []
         for axis, span in enumerate((self.rows, self.columns)):
             whole = log.capture.shape[axis] // (2 if halved else 1)
             low, high = (n // (2 if halved else 1) for n in span) if span else (0, whole)
@@ -86,14 +85,9 @@ class TruthAlignment:
                     f"others, up to {whole}"
                 )
             pixel, scale = size / image.shape[1 + axis], truth.shape[1 + axis] / (high - low)
-            scales.append(scale)
             here = slice(round((first - begin) / pixel), round((last - begin) / pixel))
             parts.append((here, slice(round((first - low) * scale), round((last - low) * scale))))
-        if self.source == TruthAlignment.source and abs(scales[0] / scales[1] - 1) > _STRETCHED:
-            raise MeasurementError(
-                f"truths of {truth.shape[1]}×{truth.shape[2]} pixels do not cover the capture of "
-                f"{log.capture.shape[0]}×{log.capture.shape[1]}; give what they cover: --truth-area"
-            )
+        self.check_shapes(log.capture.shape, truth.shape[1:])
         image = image[:, ::-1, ::-1] if self.turned else image
         (rows, seen_rows), (columns, seen_columns) = parts
         image, truth = image[:, rows, columns], truth[:, seen_rows, seen_columns]
@@ -103,6 +97,18 @@ class TruthAlignment:
             raise MeasurementError(f"the image has {len(image)} channels and truth {len(truth)}")
         truth = _resized(truth, (image.shape[1], image.shape[2]))
         return (image[:, ::-1], truth[:, ::-1]) if self.upside_down else (image, truth)
+
+    def check_shapes(self, capture: Sequence[int], truth: Sequence[int]) -> None:
+        """MeasurementError where nobody said what truths cover, and pixels would be stretched."""
+        (rows, columns), (high, wide) = capture[:2], truth[:2]
+        given = zip((self.rows, self.columns), (rows, columns), strict=True)
+        seen = [span[1] - span[0] if span else whole for span, whole in given]
+        stretched = abs(seen[0] * wide / (seen[1] * high) - 1) > _STRETCHED
+        if self.source == TruthAlignment.source and stretched:
+            raise MeasurementError(
+                f"truths of {high}×{wide} pixels do not cover the capture of {rows}×{columns}; "
+                "give what they cover: --truth-area"
+            )
 
 
 def _resized(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -251,7 +251,8 @@ class TestRefused:
             (("--method", "ridge", "--method", "ridge"), "has one twice"),
             (("--tau", -1), "tau"),
             (("--limit", 0), "--limit 0: give at least 1"),
-            (("--split", "test"), "has no split 'test'; there are all"),
+            (("--split", "test"), "has no split 'test'; there are all$"),
+            (("--psf", "psfs.tif"), "psfs.tif: does not exist; give an image, or a folder of"),
             (("--workers", 0), "--workers 0: give at least 1"),
             (("--shift", -1), "--shift -1"),
             (("--truth-area", "5:2,1:3"), "--truth-area 5:2,1:3: give the first row"),
@@ -259,7 +260,15 @@ class TestRefused:
     )
     def test_options(self, folder, tmp_path, options, part):
         result = call("evaluate", folder, *options, "--out", tmp_path / "out")
-        assert result.exit_code == 2 and part in one_line(result)
+        assert result.exit_code == 2 and part in one_line(result) + "$"
+        assert not (tmp_path / "out").exists()
+
+    def test_truths_of_another_shape(self, folder, tmp_path):
+        """Before any image is reconstructed, and not where somebody says what they cover."""
+        for truth in folder.glob("truths/*.npy"):
+            np.save(truth, np.load(truth)[:-6])
+        result = call("evaluate", folder, *LINEAR, "--out", tmp_path / "out")
+        assert "give what they cover: --truth-area" in one_line(result)
         assert not (tmp_path / "out").exists()
 
     def test_no_psf(self, folder, tmp_path):

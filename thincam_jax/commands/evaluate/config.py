@@ -63,7 +63,13 @@ class EvaluationConfig(Section):
                 upside_down=was.upside_down,
                 source="given",
             )
-        return dataclasses.replace(pairs, **changes)
+        pairs = dataclasses.replace(pairs, **changes)
+        try:
+            first = pairs[0]
+        except MeasurementError:
+            return pairs  # it is told with the scores
+        pairs.alignment.check_shapes(first.capture.pixels.shape, first.truth.shape[1:])
+        return pairs
 
     def sources(self, psf: Path, psf_scale: float | None) -> Sources:
         """Files and preparation as of `thincam reconstruct`, for the PSF of a mask."""
