@@ -67,7 +67,7 @@ class EvaluationConfig(Section):
         try:
             first = pairs[0]
         except MeasurementError:
-            return pairs  # it is told with the scores
+            return pairs  # reported with the scores
         pairs.alignment.check_shapes(first.capture.pixels.shape, first.truth.shape[1:])
         return pairs
 
