@@ -15,7 +15,7 @@ from thincam_jax.imaging.operators import Separable, Sparse
 from thincam_jax.imaging.refractive_index import CauchyIndex
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
-from thincam_jax.waveguide import planning
+from thincam_jax.waveguide import planning, probe
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres
 from thincam_jax.waveguide.system import LitPlane, seen_size, smeared_rays, system_matrix
 
@@ -33,7 +33,8 @@ def all_optimised(camera, pixels, plane, orders, samples):
 
 @pytest.fixture(autouse=True)
 def long_programs_optimised(monkeypatch):
-    monkeypatch.setattr(planning, "smeared_rays", all_optimised)
+    for module in (planning, probe):
+        monkeypatch.setattr(module, "smeared_rays", all_optimised)
 
 
 def reference(plan, plane):

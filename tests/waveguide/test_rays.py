@@ -1,5 +1,7 @@
 """Rays against the errata's exact values, a 3-D tracer of surfaces, and finite differences."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,19 +64,21 @@ def turned(tilt):
     return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ about_x
 
 
-def traced(pixel, order, distance, tilt=(0.0, 0.0), index=1.5, width=5.0):
+def traced(pixel, order, distance, tilt=(0.0, 0.0), lens=(0.0, 0.0), focus=None):
     """Surface by surface: lens, glass, hologram, 2i total reflections, hologram, glass, object.
 
     Within a tilted plate in its own axes, from where the camera's axis meets its rear surface.
     """
+    index, width = 1.5, 5.0
     k_recorded = 2 * np.pi * index / 532e-6
     angle = np.radians(61.2)
     fringes = k_recorded * np.array([0, -np.sin(angle), 1 + np.cos(angle)])
     rear, front = 0.0, width
     axes, corner = turned(tilt), np.array([0, 0, 16.0])
     y, x = pixel
-    ray = axes.T @ unit(np.array([-x, -y, 6.0]))
-    point = to_plane(axes.T @ (np.array([x, y, 0.0]) - corner), ray, rear)
+    start, sharp = np.array([*lens[::-1], 6.0]), np.array([-x, -y, 6.0]) * (focus or 1e9) / 6.0
+    ray = axes.T @ unit(sharp - [*lens[::-1], 0.0])
+    point = to_plane(axes.T @ (start - corner), ray, rear)
     ray = snell(ray, 1.0, index)
     point = to_plane(point, ray, front)
     # The wavelength at which |k s − K| = k: the diffracted wave has the film's wavenumber.
@@ -90,15 +94,19 @@ def traced(pixel, order, distance, tilt=(0.0, 0.0), index=1.5, width=5.0):
     return ended, 2 * np.pi * index / k
 
 
-@pytest.mark.parametrize("tilt", [(0.0, 0.0), TILT])
-def test_a_tracer_of_surfaces(tilt):
+@pytest.mark.parametrize(
+    ("tilt", "lens", "focus"),
+    [((0.0, 0.0), (0.0, 0.0), None), (TILT, (0.0, 0.0), 300.0), (TILT, (0.7, -1.2), 300.0)],
+)
+def test_a_tracer_of_surfaces(tilt, lens, focus):
     random = np.random.default_rng(5)
     pixels = random.uniform(-1.2, 1.2, (40, 2))
-    sts = eqx.tree_at(lambda c: c.tilt, camera(), jnp.asarray(tilt))
+    places = {"tilt": np.array(tilt), "focus_distance": focus, "lens_point": np.array(lens)}
+    sts = dataclasses.replace(camera(), **places)
     rays = wg.trace(sts, jnp.asarray(pixels), object_distance=550.0)
     assert not rays.status.any()
     for order in range(4):
-        expected = [traced(pixel, order, 550.0, tilt) for pixel in pixels]
+        expected = [traced(pixel, order, 550.0, tilt, lens, focus) for pixel in pixels]
         points, wavelengths = zip(*expected, strict=True)
         np.testing.assert_allclose(rays.points[order], points, rtol=0, atol=1e-10)
         np.testing.assert_allclose(rays.wavelength, wavelengths, rtol=1e-13)

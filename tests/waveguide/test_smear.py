@@ -1,19 +1,24 @@
 """The smear of a pixel's colours, against each wavelength traced surface by surface."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from waveguide.setting import camera, hologram
+from waveguide.test_rays import snell, to_plane, turned
 
 import thincam_jax as tc
+from helpers import relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.units import nm, um
 from thincam_jax.waveguide.efficiency import diffraction_efficiency
 from thincam_jax.waveguide.rays import pixel_centres
-from thincam_jax.waveguide.smear import trace_band
+from thincam_jax.waveguide.smear import direct_rays, trace_band
+from thincam_jax.waveguide.system import LitPlane, planes_operator, seen_size, system_matrix
 
 PIXELS = [(0.0, 0.0), (1.0536, 0.0), (-1.0536, -1.0536)]
 
@@ -135,3 +140,42 @@ def test_a_capture_is_the_sum_over_the_band():
                 expected[row, column] += light * image[np.ix_(rows, columns)].sum() / 3600
     expected /= level / 30
     np.testing.assert_allclose(operator(jnp.asarray(image)), expected, atol=6e-3)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.03, -0.05)])
+def test_direct_light_is_refracted_at_two_planes(tilt):
+    """Followed surface by surface; a cover stops what meets it on the front surface."""
+    axes, pixel = turned(tilt), np.array([0.6, -0.9])
+    corner, start = np.array([0.0, 0.0, 10.0]), np.zeros(3)
+    ray = axes.T @ np.array([*-pixel[::-1], 6.0])
+    place = to_plane(axes.T @ (start - corner), ray, 0.0)
+    front = to_plane(place, snell(ray / np.linalg.norm(ray), 1.0, 1.5), 5.0)
+    ended = to_plane(corner + axes @ front, axes @ ray, 10.0 + 5.0 + 550.0)
+    made = dataclasses.replace(camera(), tilt=np.array(tilt), direct_band=200 * nm)
+    rays = direct_rays(made, jnp.asarray(pixel[None]), 550.0)
+    np.testing.assert_allclose(rays.points[0, 0, 0], ended[1::-1], atol=1e-10)
+    assert rays.weight.tolist() == [[pytest.approx(200e-6)]]
+    for height, left in ((abs(front[1]) * 2 + 0.01, 0.0), (abs(front[1]) * 2 - 0.01, 200e-6)):
+        tape = wg.Rectangle((0.0, 0.0), (height, 20.0))
+        covered = eqx.tree_at(lambda c: c.screen.cover, made, tape, is_leaf=lambda n: n is None)
+        found = direct_rays(covered, jnp.asarray(pixel[None]), 550.0).weight
+        assert found[0, 0] == pytest.approx(left)
+
+
+def test_direct_light_is_added_to_the_capture():
+    plane = wg.ObjectPlane((24, 28), distance=550.0, width=150.0, centre=(0.0, 0.0))
+    sensor = tc.Sensor((20, 14), 120 * um)
+    dark = dataclasses.replace(camera(), sensor=sensor)
+    lit = dataclasses.replace(dark, direct_band=200 * nm)
+    image = jnp.asarray(np.random.default_rng(3).uniform(size=plane.shape))
+    with_light, without = (wg.system_operator(c, plane) for c in (lit, dark))
+    level = np.mean(wg.trace(dark, pixel_centres(dark), object_distance=550.0).weight.sum(axis=0))
+    rays = direct_rays(lit, pixel_centres(lit), 550.0)
+    alone = system_matrix(rays, plane, float(seen_size(dark, plane)), float(level)) @ image.ravel()
+    added = np.asarray(with_light(image) - without(image)).ravel()
+    np.testing.assert_allclose(added, alone, rtol=1e-9)
+    assert alone.max() > 10  # some 200 nm for some 5
+    plan = wg.plan_screen(lit, LitPlane(plane, image), tolerance=0.02)
+    planned = plan.system()(image.astype(jnp.dtype(plan.precision)))
+    every = planes_operator(lit, plane, (12, 8), plan.level)(image)
+    assert relative_l2(np.asarray(planned, float), np.asarray(every)) <= plan.predicted_error

@@ -1,6 +1,7 @@
 """The names of `thincam_jax.waveguide`; `__init__.py` reads them from here."""
 
 from ..imaging.refractive_index import CauchyIndex as CauchyIndex
+from .camera import ObjectPlane as ObjectPlane
 from .camera import Rectangle as Rectangle
 from .camera import Screen as Screen
 from .camera import SeeThroughCamera as SeeThroughCamera
@@ -12,5 +13,4 @@ from .planning import plan_screen as plan_screen
 from .rays import check_screen as check_screen
 from .rays import trace as trace
 from .system import LitPlane as LitPlane
-from .system import ObjectPlane as ObjectPlane
 from .system import system_operator as system_operator

@@ -43,6 +43,8 @@ class Screen(Module):
     - `hologram`: on the front surface before the camera and on the rear surface before the object.
     - `glass_thickness`: w, mm. `glass_index`: index of the plate.
     - `top`, `bottom`: extents of the holograms, mm from the camera's axis; None: everywhere.
+    - `cover`: black tape on the front surface, which stops light that would come straight through
+      the plate to the camera; None for none.
     """
 
     hologram: VolumeHologram = eqx.field(
@@ -54,19 +56,29 @@ class Screen(Module):
     glass_index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     top: Rectangle | None = None
     bottom: Rectangle | None = None
+    cover: Rectangle | None = None
 
 
-def _tilt(name: str, value: Any) -> Array:
-    return checks.finite(name, np.zeros(2) if value is None else value, "rad", shape=(2,))
+def _two(unit: str) -> Any:
+    def check(name: str, value: Any) -> Array:
+        return checks.finite(name, np.zeros(2) if value is None else value, unit, shape=(2,))
+
+    return quantity(unit, check=check)
 
 
 class SeeThroughCamera(Module):
     """A screen and the camera behind its top hologram.
 
-    - `focal_distance`: d0, from the sensor to the lens, mm; the lens is a pinhole here.
+    - `focal_distance`: d0, from the sensor to the lens, mm.
     - `lens_distance`: d1, from the lens to the plate's rear surface, mm.
     - `tilt`: angles of the plate against the camera, about x and then about y, rad; None for none.
       It turns about where the camera's axis meets its rear surface; the object's plane stays.
+    - `aperture`: diameter of the thin lens, mm; 0: a pinhole, which shows all distances sharply.
+    - `focus_distance`: from the lens to what it shows sharply without the screen, mm; None for
+      infinity.
+    - `direct_band`: width, mm, of the band of colours in which light straight through the plate is
+      as bright to the sensor as the object; 0 where black tape lets none through.
+    - `lens_point`: (y, x) where rays cross the lens, mm; None: its middle. `lens_views` sets it.
     """
 
     screen: Screen = eqx.field(
@@ -75,7 +87,15 @@ class SeeThroughCamera(Module):
     sensor: Sensor = eqx.field(converter=as_sensor)
     focal_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     lens_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
-    tilt: Float[Array, "2"] = eqx.field(default=None, converter=quantity("rad", check=_tilt))
+    tilt: Float[Array, "2"] = eqx.field(default=None, converter=_two("rad"))
+    aperture: Float[Array, ""] = eqx.field(default=0.0, converter=quantity("mm", non_negative=True))
+    focus_distance: Float[Array, ""] | None = eqx.field(
+        default=None, converter=quantity("mm", positive=True, optional=True)
+    )
+    direct_band: Float[Array, ""] = eqx.field(
+        default=0.0, converter=quantity("mm", non_negative=True)
+    )
+    lens_point: Float[Array, "2"] = eqx.field(default=None, converter=_two("mm"))
 
     @property
     def plate_axes(self) -> Float[Array, "3 3"]:
@@ -87,6 +107,31 @@ class SeeThroughCamera(Module):
             (-sin_y, cos_y * sin_x, cos_y * cos_x),
         )
         return jnp.stack([jnp.stack(row) for row in rows])
+
+
+class ObjectPlane(Module):
+    """A flat object before the screen, of square cells of uniform radiance, as those of a monitor.
+
+    - `shape`: (rows, columns) of cells.
+    - `distance`: d2, from the plate's front surface, mm.
+    - `width`: width of the object, mm.
+    - `centre`: (y, x) of its middle from the camera's axis, mm; +y is down.
+    """
+
+    shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
+    distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
+
+    @property
+    def pitch(self) -> Float[Array, ""]:
+        """Side of the cells, mm."""
+        return self.width / self.shape[1]
+
+    @property
+    def extent(self) -> Rectangle:
+        """Outline of all cells."""
+        return Rectangle(self.centre, self.pitch * np.asarray(self.shape, self.width.dtype))
 
 
 def without_dispersion(camera: SeeThroughCamera) -> SeeThroughCamera:

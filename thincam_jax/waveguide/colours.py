@@ -38,12 +38,13 @@ from thincam_jax._core.precision import AccuracyWarning, product
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.units import nm
-from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera
 from thincam_jax.waveguide.efficiency import axial_band, in_blocks, least_nodes, unpolarised
 from thincam_jax.waveguide.hologram import VolumeHologram
+from thincam_jax.waveguide.lens import lens_views
 from thincam_jax.waveguide.rays import at_rear, on_object, pixel_centres, shift, straight_on
 from thincam_jax.waveguide.smear import SmearedRays, equal_parts, guided_band, meets
-from thincam_jax.waveguide.system import ObjectPlane, seen_size, system_matrix
+from thincam_jax.waveguide.system import bandwidth, seen_size, system_matrix
 
 # Neighbouring gratings nearer than so many widths of a band: at Δn of 0.006 to 0.03 and 6 to 24 nm
 # apart integrals are up to 15 % off below it, at most 2 % above.
@@ -102,6 +103,11 @@ class ColourCamera(Module):
         first, *others = (eqx.tree_at(lambda c: c.screen.hologram, c, 0) for c in self.cameras)
         if not all(checks.is_traced(c.sensor.pitch) or eqx.tree_equal(c, first) for c in others):
             raise ValueError("cameras differ in more than their hologram; give one, with each")
+        if not checks.is_traced(first.direct_band) and first.direct_band > 0:
+            raise ValueError(
+                "direct light has no colours here; give direct_band=0, or system_operator a list "
+                "of cameras whose colours the sensor separates"
+            )
         if checks.holds_traced(self.cameras):
             return
         bands = sorted(axial_band(one.screen.hologram) for one in self.cameras)
@@ -125,6 +131,11 @@ class ColourCamera(Module):
     def gratings(self) -> VolumeHologram:
         """All in one, with a first axis for the gratings."""
         return jax.tree.map(lambda *p: jnp.stack(p), *(c.screen.hologram for c in self.cameras))
+
+    def at(self, lens_point: Float[Array, "2"]) -> "ColourCamera":
+        """The camera whose rays cross the lens there."""
+        places = [lens_point] * len(self.cameras)
+        return eqx.tree_at(lambda c: [one.lens_point for one in c.cameras], self, places)
 
     @eqx.filter_jit
     def trace(
@@ -234,12 +245,16 @@ def colour_system(
     pixels, size = pixel_centres(first), float(seen_size(first, plane))
     blocks: list[list[Any]] = [[None] * shape[1] for _ in range(shape[0])]
     found, counts = np.zeros(shape[0]), (orders, samples)
-    for out in range(len(camera.cameras)):
-        points, weight = camera.trace(pixels, plane.distance, jnp.asarray(out), counts)
+    views = lens_views(first, [plane], orders)
+    for out, view in itertools.product(range(len(camera.cameras)), views):
+        seen = camera.at(view.camera.lens_point)
+        points, weight = seen.trace(pixels, plane.distance, jnp.asarray(out), counts)
+        weight = weight * view.share
         for way, c, p in np.ndindex(weight.shape[:3]):
             if modelled(crosstalk, way, c, p, out):
-                found[c] += float(jnp.mean(jnp.sum(weight[way, c, p], axis=0)))
-                one = system_matrix(SmearedRays(points[way], weight[way, c, p]), plane, size, 1.0)
+                rays = SmearedRays(points[way], weight[way, c, p])
+                found[c] += bandwidth(rays)
+                one = system_matrix(rays, plane, size, 1.0)
                 blocks[c][p] = one if blocks[c][p] is None else blocks[c][p] + one
     levels = tuple(found.tolist()) if levels is None else levels
     if not min(levels) > 0:

@@ -76,8 +76,9 @@ def trace(
     - `orders`: number of ghosts, i = 0 … orders − 1, of 2i total reflections each.
     - `extent`: limits of the object, (y, x) mm from the camera's axis; None is infinite.
 
-    The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg
-    wavelength of each pixel; the weights include the rest of the band, but not its smear.
+    Rays cross the lens at the camera's `lens_point`, by default its middle, and the holograms are
+    thin against the glass. They are those of the Bragg wavelength of each pixel; the weights
+    include the rest of the band, but not its smear.
     """
     checks.at_least_one({"orders": orders})
     distance = checks.positive("object_distance", object_distance, "mm")
@@ -130,7 +131,7 @@ class BraggRays(eqx.Module):
 def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> BraggRays:
     """Rays from pixels, (y, x) mm, through lens and rear surface to the top hologram."""
     hologram = camera.screen.hologram
-    axes, slope = camera.plate_axes, -pixels[..., ::-1] / camera.focal_distance
+    axes, slope = camera.plate_axes, slopes(camera, pixels)
     across = product(slope, axes[:2, :2]) + axes[2, :2]
     across = across / jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True) + 1)
     wavelength, matched = hologram.bragg_wavelength(across)
@@ -151,6 +152,12 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
     ):
         fault = jnp.where(sound, fault, int(status))
     return BraggRays(slope, across, wavelength, guided, left, fault)
+
+
+def slopes(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Float[Array, "*pixel 2"]:
+    """x/z and y/z of rays through the lens' point to where a pixel (y, x) is sharp."""
+    along, sharp = pixels / camera.focal_distance, camera.focus_distance
+    return -(along if sharp is None else along + camera.lens_point / sharp)[..., ::-1]
 
 
 class RayPath(eqx.Module):
@@ -191,10 +198,12 @@ def ray_status(
 
 def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:
     """Points (x, y), mm, at which rays from the lens meet the plate's rear surface."""
-    axes = camera.plate_axes
+    axes, start = camera.plate_axes, camera.lens_point[::-1]
     tangential = product(slope, axes[:2, :2]) + axes[2, :2]
     normal = product(slope, axes[:2, 2]) + axes[2, 2]
-    return camera.lens_distance * (axes[2, 2] * tangential / normal[..., None] - axes[2, :2])
+    height = camera.lens_distance * axes[2, 2] - product(start, axes[:2, 2])
+    across = product(start, axes[:2, :2]) - camera.lens_distance * axes[2, :2]
+    return height * tangential / normal[..., None] + across
 
 
 def straight_on(
@@ -203,7 +212,7 @@ def straight_on(
     """Points (x, y), mm, on the object that rays meet without displacement by the plate."""
     normal, width = camera.plate_axes[:, 2], camera.screen.glass_thickness
     further = width * (normal[:2] + (1 - normal[2]) * slope)
-    return (camera.lens_distance + distance) * slope + further
+    return camera.lens_point[::-1] + (camera.lens_distance + distance) * slope + further
 
 
 def on_object(

@@ -64,6 +64,25 @@ def trace_band(
     )
 
 
+@eqx.filter_jit
+def direct_rays(
+    camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"], object_distance: Number
+) -> SmearedRays:
+    """Light that comes straight through the plate past its cover, as if it were one ghost.
+
+    It has the weight `direct_band`: the nanometres that the top hologram diffracts are not missing.
+    """
+    distance = checks.positive("object_distance", object_distance, "mm")
+    screen, rays = camera.screen, bragg_rays(camera, pixels)
+    across = screen.glass_thickness * shift(rays.across, screen.glass_index(rays.wavelength))
+    ends = straight_on(camera, rays.slope, distance) + on_object(camera, rays.slope, across)
+    weight = jnp.broadcast_to(camera.direct_band, rays.wavelength.shape)
+    if screen.cover is not None:
+        stopped = screen.cover.holds((at_rear(camera, rays.slope) + across)[..., ::-1])
+        weight = jnp.where(stopped, 0, weight)
+    return SmearedRays(ends[None, ..., None, ::-1], weight[None])
+
+
 def _one(camera, pixel, distance, counts):
     """The centre (2) of a pixel's samples, their offsets (order, sample, 2), and weights."""
     orders, samples, nodes = counts

@@ -1,7 +1,9 @@
 """The see-through-screen camera as a linear operator (thesis Eq 5.10)."""
 
+import functools
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -12,33 +14,12 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
-from thincam_jax._core.module import Module
 from thincam_jax._core.progress import watched
-from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
-from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera
+from thincam_jax.waveguide.lens import LensView, lens_views
 from thincam_jax.waveguide.rays import check_screen, pixel_centres, trace
-from thincam_jax.waveguide.smear import SmearedRays, trace_band
-
-
-class ObjectPlane(Module):
-    """A flat object before the screen, of square cells of uniform radiance, as those of a monitor.
-
-    - `shape`: (rows, columns) of cells.
-    - `distance`: d2, from the plate's front surface, mm.
-    - `width`: width of the object, mm.
-    - `centre`: (y, x) of its middle from the camera's axis, mm; +y is down.
-    """
-
-    shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
-    distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
-    width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
-    centre: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
-
-    @property
-    def pitch(self) -> Float[Array, ""]:
-        """Side of the cells, mm."""
-        return self.width / self.shape[1]
+from thincam_jax.waveguide.smear import SmearedRays, direct_rays, trace_band
 
 
 class LitPlane(eqx.Module):
@@ -149,10 +130,13 @@ def system_operator(
     - `samples`: parts of the band of each pixel and order, as `trace_band` divides it; None for
       the Bragg wavelength alone, without the smear of the band.
 
-    Vignetting by the lens and the pixel's own response are left out.
+    Light straight through the plate is added where the camera has a `direct_band`.
+
+    Of a lens with an aperture a pixel sees the mean of `lens_views`, with the defocus of every
+    order. Vignetting by the lens and the pixel's own response are left out.
 
     **Errors**: ValueError where no pixel has a guided ray, for planes of different cells and
-    sensors of different pixels, and for cells below a 64th of a pixel's field.
+    sensors of different pixels, for cells below a 64th of a pixel's field, and a blur of 32 pixels.
     """
     if isinstance(camera, list | tuple):
         return colour_operator(
@@ -174,15 +158,18 @@ def planes_operator(
     if not isinstance(planes, Sequence) or not all(isinstance(p, ObjectPlane) for p in planes):
         raise TypeError(f"plane is {checks.shown(plane)}; give a waveguide.ObjectPlane, or several")
     shape = require_same("planes", "cells", [one.shape for one in planes])
-    matrices = []
-    for one in planes:
-        rays = smeared_rays(camera, pixel_centres(camera), one, *counts)
-        level = float(jnp.mean(jnp.sum(rays.weight, axis=0))) if level is None else level
-        if level == 0:
-            raise ValueError(
-                "no light reaches the sensor by this screen; waveguide.check_screen says why"
-            )
-        matrices.append(system_matrix(rays, one, float(seen_size(camera, one)), level))
+    views = lens_views(camera, planes, counts[0])
+    if level is None:
+        level = bandwidth(smeared_rays(camera, pixel_centres(camera), planes[0], *counts))
+    if level == 0:
+        raise ValueError(
+            "no light reaches the sensor by this screen; waveguide.check_screen says why"
+        )
+
+    def rays_to(plane: ObjectPlane):
+        return lambda one: smeared_rays(one, pixel_centres(one), plane, *counts)
+
+    matrices = [lens_matrix(views, rays_to(one), one, level) for one in planes]
     whole = shape if isinstance(plane, ObjectPlane) else (len(planes), *shape)
     return Sparse(scipy.sparse.hstack(matrices), whole, camera.sensor.shape)
 
@@ -206,6 +193,27 @@ def require_same(what: str, parts: str, shapes: Sequence[tuple[int, ...]]) -> tu
     if len(set(shapes)) != 1:
         raise ValueError(f"{what} have {list(shapes)} {parts}; give at least one, all of one shape")
     return shapes[0]
+
+
+def bandwidth(rays: SmearedRays) -> float:
+    """Mean weight of the pixels' orders together, mm."""
+    return float(jnp.mean(jnp.sum(rays.weight, axis=0)))
+
+
+def lens_matrix(
+    views: Sequence[LensView],
+    rays_of: Callable[[SeeThroughCamera], SmearedRays],
+    plane: ObjectPlane,
+    level: float,
+):
+    """H of a lens, the mean of its views, with direct light; `level`: weight that is 1."""
+    size, found = float(seen_size(views[0].camera, plane)), []
+    for view in views:
+        seen = [rays_of(view.camera)]
+        if float(view.camera.direct_band) > 0:
+            seen.append(direct_rays(view.camera, pixel_centres(view.camera), plane.distance))
+        found += [system_matrix(rays, plane, size, level / view.share) for rays in seen]
+    return functools.reduce(operator.add, found)
 
 
 def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: float):

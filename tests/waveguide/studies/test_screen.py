@@ -1,5 +1,7 @@
 """Screen studies: the right model is the best, and the mistakes are those of the thesis."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -7,6 +9,8 @@ from waveguide.studies import tiny_screen
 
 import thincam_jax as tc
 from thincam_jax.studies.pictures import PublishedImage
+from thincam_jax.units import nm
+from thincam_jax.waveguide.studies.mask import ScreenMask
 from thincam_jax.waveguide.studies.screen import ScreenModel, mistaken_rays
 
 SINGLE = (ScreenModel("right"), ScreenModel("single", "no_ghosts"))
@@ -48,6 +52,28 @@ def test_forgotten_ghosts_cost_an_image():
         pyplot.close("all")
     of_targets = [score.psnr_db for score in right.scores.targets.values()]
     assert right.scores.mean_psnr_db == pytest.approx(np.mean(of_targets), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "places", "lost"),
+    [
+        pytest.param(
+            *("no_defocus", {"aperture": 6.0, "focus_distance": 150.0}, 0.5),
+            marks=pytest.mark.thorough,
+        ),
+        ("no_direct", {"direct_band": 20 * nm}, 3.0),
+    ],
+)
+def test_forgotten_light_costs_an_image(mistake, places, lost):
+    """That which crosses a lens beside its middle, or comes straight through the plate."""
+    seen = dataclasses.replace(tiny_screen.camera(), **places)
+    models = ScreenModel("right"), ScreenModel("wrong", mistake)
+    study = tiny_screen.study(seen, models=models, solvers={"CGM": tc.Ridge(1.0)}, band_samples=1)
+    right, wrong = (one.methods["CGM"].scores for one in study.run().models.values())
+    assert right.mean_psnr_db > wrong.mean_psnr_db + lost
+    mask = ScreenMask(tc.FresnelZoneAperture(beta=25.0, width=1.0))
+    with pytest.raises(ValueError, match=f"{next(iter(places))} is of a camera with a lens; give"):
+        tiny_screen.study(seen, band_samples=None, models=models[:1], mask=mask)
 
 
 @pytest.fixture(scope="module")

@@ -79,10 +79,16 @@ class PlateConfig(section(wg.Screen, without=("hologram",), defaults={"glass_ind
     tilt: tuple[Acute, Acute] = (0.0, 0.0)
     top: RectangleConfig | None = None
     bottom: RectangleConfig | None = None
+    cover: RectangleConfig | None = None
 
 
-class LensConfig(section(wg.SeeThroughCamera, only=("focal_distance", "lens_distance"))):
-    """Distances from sensor to lens (d0) and from lens to plate (d1)."""
+_LENS = ("focal_distance", "lens_distance", "aperture", "focus_distance", "direct_band")
+
+
+class LensConfig(
+    section(wg.SeeThroughCamera, only=_LENS, defaults={"aperture": None, "direct_band": None})
+):
+    """Distances from sensor to lens (d0) and from there to the plate (d1), focus, stray light."""
 
 
 class ScreenMaskConfig(section(ScreenMask, without=("mask",)), MaskConfig):
@@ -138,9 +144,9 @@ class SeeThroughConfig(Section):
     band_samples: Annotated[int, Field(ge=1, le=64)] | None = None
 
     @property
-    def distances(self) -> tuple[float, float]:
-        """Distances from the sensor to the lens or mask, and from there to the plate, mm."""
-        return self.lens.focal_distance, self.lens.lens_distance
+    def optics(self) -> dict[str, Any]:
+        """Lens or mask, as parameters of `waveguide.SeeThroughCamera`."""
+        return {name: value for name, value in self.lens if value is not None}
 
 
 class ScreenConfig(SeeThroughConfig, ExperimentConfig):
@@ -187,5 +193,7 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
         return self
 
     @property
-    def distances(self) -> tuple[float, float]:
-        return (self.mask.distance, self.mask.gap) if self.mask else super().distances
+    def optics(self) -> dict[str, Any]:
+        if self.mask is None:
+            return super().optics
+        return {"focal_distance": self.mask.distance, "lens_distance": self.mask.gap}

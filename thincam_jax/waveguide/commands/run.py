@@ -18,6 +18,7 @@ from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.pictures import PUBLISHED, finding
 from thincam_jax.waveguide import plot
 from thincam_jax.waveguide.commands.config import CalibrationConfig, ScreenConfig, SeeThroughConfig
+from thincam_jax.waveguide.lens import lens_views
 from thincam_jax.waveguide.studies.calibration import MEASURED, CalibrationRun, CalibrationScores
 from thincam_jax.waveguide.studies.mask import ScreenMask
 from thincam_jax.waveguide.studies.screen import (
@@ -86,8 +87,9 @@ def build_cameras(config: SeeThroughConfig) -> tuple[wg.SeeThroughCamera, ...]:
     film = config.hologram
     films = [film.build(wavelength=one).processed(film.shrinkage) for one in film.recorded]
     screens = [config.screen.build(hologram=one) for one in films]
-    others = config.sensor.build(), *config.distances, np.asarray(config.screen.tilt)
-    return tuple(wg.SeeThroughCamera(screen, *others) for screen in screens)
+    others: dict[str, Any] = config.optics | {"tilt": np.asarray(config.screen.tilt)}
+    sensor = config.sensor.build()
+    return tuple(wg.SeeThroughCamera(screen, sensor, **others) for screen in screens)
 
 
 def run_screen(study: ScreenStudy, folder: RunFolder, progress: Progress) -> ScreenResult:
@@ -208,10 +210,12 @@ def rays(asked: Any, setup: Any) -> Iterator[str]:
         return
     cameras = build_cameras(asked) if setup is None else setup.cameras
     plane = build_plane(asked) if setup is None else setup.plane
-    traced = rows * columns * asked.orders * parts * len(cameras)
+    points = len(lens_views(cameras[0], [plane], asked.orders))
+    traced = rows * columns * asked.orders * parts * len(cameras) * points
     entries = traced * entries_of_a_ray(cameras[0], plane)
+    lens = f", {points} points of the lens" if points > 1 else ""
     yield (
         f"matrix of each model: {rows}×{columns} pixels, {asked.orders} orders, {parts} parts of "
-        f"the band: {traced / 1e6:.3g} million rays, at most {entries / 1e6:.3g} million entries, "
-        f"{readable(12 * entries)}"  # a number and two indices, four bytes each
+        f"the band{lens}: {traced / 1e6:.3g} million rays, at most {entries / 1e6:.3g} million "
+        f"entries, {readable(12 * entries)}"  # a number and two indices, four bytes each
     )

@@ -36,16 +36,25 @@ from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.colours import colour_system
 from thincam_jax.waveguide.field_of_view import FieldOfView, field_of_view
 from thincam_jax.waveguide.hologram import directions
+from thincam_jax.waveguide.lens import lens_views
 from thincam_jax.waveguide.rays import Rays, RayStatus, bragg_rays, pixel_centres
 from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.studies.mask import MaskSystem, ScreenMask, require_mask_fits
-from thincam_jax.waveguide.system import colour_operator, seen_size, smeared_rays, system_matrix
+from thincam_jax.waveguide.system import bandwidth, colour_operator, lens_matrix, smeared_rays
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Mistake = Literal[
-    "none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear", "no_crosstalk"
+    "none",
+    "grating",
+    "ghost_index",
+    "shift_invariant",
+    "no_ghosts",
+    "no_smear",
+    "no_defocus",
+    "no_direct",
+    "no_crosstalk",
 ]
 MISTAKES: dict[Mistake, str] = {
     "none": "as the camera is",
@@ -54,8 +63,12 @@ MISTAKES: dict[Mistake, str] = {
     "shift_invariant": "the ghosts of the axis everywhere: a convolution",
     "no_ghosts": "the first image alone",
     "no_smear": "each pixel's Bragg wavelength alone, without the band about it",
+    "no_direct": "as if black tape stopped all light that comes straight through the plate",
+    "no_defocus": "a pinhole in place of the lens, which shows all distances sharply",
     "no_crosstalk": "a sensor that separates the colours of the gratings",
 }
+# Numbers of the camera that are 0 in a model with that mistake.
+LEFT_OUT: dict[Mistake, str] = {"no_defocus": "aperture", "no_direct": "direct_band"}
 
 GLASS = quantity("mm", positive=True, optional=True)
 
@@ -147,6 +160,9 @@ class ScreenStudy:
         if self.mask is not None:
             mistakes, tilt = [model.mistake for model in self.models], np.asarray(self.camera.tilt)
             require_mask_fits(mistakes, len(self.cameras), self.band_samples, tilt.tolist())
+            for name in LEFT_OUT.values():
+                if getattr(self.camera, name) > 0:
+                    raise ValueError(f"{name} is of a camera with a lens; give 0 with a mask")
 
     @property
     def camera(self) -> wg.SeeThroughCamera:
@@ -218,11 +234,12 @@ class ScreenStudy:
             orders = 1 if model.mistake == "no_ghosts" else self.orders
             camera = wg.ColourCamera(cameras, self.responses)
             return colour_system(camera, self.plane, orders, self.band_samples or 1)
-        channels = []
+        channels, follow = [], partial(mistaken_rays, self, mistake=model.mistake)
         for camera in cameras:
-            rays = mistaken_rays(self, camera, model.mistake)
-            level = float(jnp.mean(jnp.sum(rays.weight, axis=0)))
-            matrix = system_matrix(rays, self.plane, float(seen_size(camera, self.plane)), level)
+            left_out = LEFT_OUT.get(model.mistake)
+            camera = replace(camera, **{left_out: 0.0}) if left_out else camera
+            views = lens_views(camera, [self.plane], self.orders)
+            matrix = lens_matrix(views, follow, self.plane, bandwidth(follow(camera)))
             channels.append(Sparse(matrix, self.plane.shape, camera.sensor.shape))
         return colour_operator(channels) if len(channels) > 1 else channels[0]
 
