@@ -139,6 +139,7 @@ MODULES = (
     "measured.exposures",
     "measured.layouts",
     "measured.pairs",
+    "reconstruction.exchange",
     "reconstruction.iterate",
     "reconstruction.noise",
     "reconstruction.problem",
@@ -149,9 +150,11 @@ MODULES = (
     "waveguide.colours",
     "waveguide.distance",
     "waveguide.field_of_view",
+    "waveguide.lens",
     "waveguide.rays",
     "waveguide.screen_to_sensor",
     "waveguide.smear",
+    "waveguide.studies.screen",
 )
 
 
@@ -288,7 +291,9 @@ CARDS = {
     "limit_of_masks": ("limit-spectra.png", 64, 27, 262),
     "mosaic": ("mosaic-psf.png", 58, 33, 350),
     "moving_objects": ("moving-objects.png", 592, 31, 256),
+    "near_screen": ("near-screen.png", 60, 10, 360),
     "optical_chart": ("optical-chart-lines.png", 893, 44, 190),
+    "other_packages": ("other-packages.png", 270, 42, 251),
     "own_sensor": ("design-landscape.png", 169, 4, 369),
     "phase_mask": ("phase-masks.png", 800, 345, 162),
     "prior": ("prior.png", 1016, 48, 294),

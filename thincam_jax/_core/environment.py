@@ -32,6 +32,8 @@ EXTRAS = {
     "codecs": "compressed TIFF and 16-bit colour PNG",
     "raw": "DNG and raw files of cameras",
     "containers": "HDF5 and MATLAB 7.3",
+    "datasets": "data sets in Parquet",
+    "deepinv": "priors of deepinv",
     "layout": "masks for lithography (GDS)",
 }
 
