@@ -95,7 +95,7 @@ def test_points_are_those_of_the_grid(factor):
 
 
 SHAPE = (17, 23)
-ONES = [np.ones(n) for n in SHAPE]
+ONES = tuple(np.ones(n) for n in SHAPE)
 
 
 def random_terms(seed, count=4):
@@ -122,7 +122,7 @@ def image(terms):
 
 def test_norm_and_distance():
     first, second = random_terms(1), random_terms(2, count=6)
-    given = [factors(terms, *ONES) for terms in (first, second)]
+    given = [factors(terms.rows, terms.columns, ONES) for terms in (first, second)]
     assert norm(given[0]) == pytest.approx(np.linalg.norm(image(first)), rel=1e-13)
     expected = np.linalg.norm(image(first) - image(second))
     assert distance(*given) == pytest.approx(expected, rel=1e-13)
@@ -132,9 +132,9 @@ def test_norm_and_distance():
 def test_weights_repeat_rows_and_columns():
     """A weight of n is n equal rows; a weight of zero is none."""
     terms = random_terms(3)
-    weights = [np.random.default_rng(n).integers(0, 4, n) for n in SHAPE]
+    weights = tuple(np.random.default_rng(n).integers(0, 4, n) for n in SHAPE)
     repeated = np.repeat(np.repeat(image(terms), weights[0], axis=0), weights[1], axis=1)
-    given = factors(terms, *(w.astype(float) for w in weights))
+    given = factors(terms.rows, terms.columns, tuple(w.astype(float) for w in weights))
     assert norm(given) == pytest.approx(np.linalg.norm(repeated), rel=1e-13)
 
 
@@ -143,7 +143,7 @@ def test_distance_of_nearly_equal_sums(size):
     """Right in all sizes, where the distance of the images' norms has long lost its digits."""
     first = random_terms(4)
     second = moved(first, size)
-    given = [factors(terms, *ONES) for terms in (second, first)]
+    given = [factors(terms.rows, terms.columns, ONES) for terms in (second, first)]
     rows, columns = (np.asarray(v) for v in (first.rows, first.columns))
     down, across = (np.asarray(v) - w for v, w in ((second.rows, rows), (second.columns, columns)))
     # The differences of the factors are exact, so that those of the images keep their digits too.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast, squared_modulus
@@ -27,7 +27,7 @@ from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
-from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
+from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.psf import closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
@@ -43,17 +43,8 @@ _PRODUCT_ROUNDING: dict[Precision, float] = {"float32": 2e-7, "float64": 5e-16}
 _EPSILON: dict[Precision, float] = {"float32": 2.0**-24, "float64": 2.0**-53}
 
 
-@dataclass(frozen=True, eq=False)
-class Lines:
-    """The rows and columns that are looked at, as centred indices, and what each stands for."""
-
-    rows: Float[np.ndarray, " row"]
-    columns: Float[np.ndarray, " column"]
-    row_weights: Float[np.ndarray, " row"]
-    column_weights: Float[np.ndarray, " column"]
-
-    def points(self, pitch: Float[Array, ""]) -> SparseGrid:
-        return SparseGrid(self.rows, self.columns, pitch)
+# Along y and along x: indices, and what each stands for.
+Both = tuple[Float[np.ndarray, " row"], Float[np.ndarray, " column"]]
 
 
 @dataclass(frozen=True)
@@ -73,8 +64,8 @@ class Numbers:
     largest_phase: float
 
 
-def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
-    """Rows and columns of the grid, denser at the edges of the shadow."""
+def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> tuple[Both, Both]:
+    """Centred indices of rows and columns of the grid, denser at the shadow's edges; weights."""
     pitch, scale = float(grid.pitch), float(path.magnification)
     # Of the whole grid the sum would be compiled for each of its shapes.
     top, left = (np.array([(1 - count) / 2]) for count in grid.shape)
@@ -87,7 +78,7 @@ def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
         indices, weights = chosen(count, (middle - half, middle + half), zone, seed=axis)
         found.append((indices - (count - 1) / 2, weights))
     (rows, row_weights), (columns, column_weights) = found
-    return Lines(rows, columns, row_weights, column_weights)
+    return (rows, columns), (row_weights, column_weights)
 
 
 @jax.jit(static_argnames=("shape", "method"))
@@ -136,31 +127,15 @@ class Factors:
 
 
 def factors(
-    terms: SeparableSum,
-    row_weights: Float[np.ndarray, " row"],
-    column_weights: Float[np.ndarray, " column"],
+    rows: Complex[ArrayLike, "term row"], columns: Complex[ArrayLike, "term column"], weights: Both
 ) -> Factors:
-    """The factors of a separable sum whose samples stand for `weights` samples each."""
-    return weighted(
-        np.asarray(terms.rows, complex),
-        np.asarray(terms.columns, complex),
-        row_weights,
-        column_weights,
-    )
-
-
-def weighted(
-    rows: Complex[np.ndarray, "term row"],
-    columns: Complex[np.ndarray, "term column"],
-    row_weights: Float[np.ndarray, " row"],
-    column_weights: Float[np.ndarray, " column"],
-) -> Factors:
-    """Real factors, scaled by the roots of the weights, of Σ Re{Y X}."""
-    rows, columns = rows * np.sqrt(row_weights), columns * np.sqrt(column_weights)
+    """Those of Σ Re{Y X} whose samples stand for `weights` samples each."""
+    both = zip((rows, columns), weights, strict=True)
+    down, across = (np.asarray(factor, complex) * np.sqrt(weight) for factor, weight in both)
     # Re{YX} = Re Y Re X − Im Y Im X.
     return Factors(
-        np.concatenate([np.real(rows), -np.imag(rows)]),
-        np.concatenate([np.real(columns), np.imag(columns)]),
+        np.concatenate([np.real(down), -np.imag(down)]),
+        np.concatenate([np.real(across), np.imag(across)]),
     )
 
 
@@ -201,13 +176,14 @@ class MaskProbe:
         self, mask: AbstractFactoredMask, grid: Grid, path: LightPath, *, pixel_integration: bool
     ) -> None:
         self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
-        self.lines = lines_of(mask, grid, path)
+        self.lines, self.weights = lines_of(mask, grid, path)
         # Those of few fringes differ by rounding, and each count is compiled; points take none.
         counted = pixel_nodes(mask, grid, path, "float64") if pixel_integration else 0
         self.nodes = max(PIXEL_NODES, counted)
-        self.given: dict[Precision, tuple[AbstractFactoredMask, Array, LightPath]]
+        self.given: dict[Precision, tuple[AbstractFactoredMask, SparseGrid, LightPath]]
         with allow("float64", mask, grid, path):
-            self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
+            points = SparseGrid(*self.lines, jnp.asarray(grid.pitch))
+            self.given = {p: cast((mask, points, path), p) for p in PRECISIONS}
         self._cache: dict[tuple[Model, Precision, int | None], Factors] = {}
 
     @functools.cached_property
@@ -221,12 +197,10 @@ class MaskProbe:
         nodes = (nodes or self.nodes) if model == "separable" else None
         key = model, precision, nodes
         if key not in self._cache:
+            method = PsfMethod(model, precision, self.pixel_integration, nodes=nodes)
             with allow(precision):
-                mask, pitch, path = self.given[precision]
-                points = self.lines.points(pitch)
-                method = PsfMethod(model, precision, self.pixel_integration, nodes=nodes)
-                terms = closed_terms(mask, points, path, method)
-                self._cache[key] = self._factors(terms)
+                terms = closed_terms(*self.given[precision], method)
+                self._cache[key] = factors(terms.rows, terms.columns, self.weights)
         return self._cache[key]
 
     @property
@@ -242,15 +216,12 @@ class MaskProbe:
         if not self.pixel_integration:
             return PIXEL_NODES
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
+            mask, points, path = self.given["float64"]
             # The irradiance's band ends at width/(λd).
             width = max(float(extent) for extent in mask.extent)
-            fringes = float(pitch) * width / float(path.wavelength * path.distance)
+            fringes = float(points.pitch) * width / float(path.wavelength * path.distance)
         enough = [n for n in _NODES if n >= fringes * math.pi / 2 + 10]
         return enough[0] if enough else _NODES[-1]
-
-    def _factors(self, terms: SeparableSum) -> Factors:
-        return factors(terms, self.lines.row_weights, self.lines.column_weights)
 
     def model_error(self, model: Model, nodes: int | None = None) -> float:
         """Relative distance of a closed form from the reference, without rounding."""
@@ -278,23 +249,22 @@ class MaskProbe:
     def angular_spectrum(self, method: PsfMethod) -> float:
         """Relative distance of the angular spectrum from the reference, rounding included."""
         with allow(method.float_type):
-            mask, pitch, path = self.given[method.float_type]
-            points = self.lines.points(pitch)
-            found = self._factors(angular_spectrum_terms(mask, points, path, self.shape, method))
+            terms = angular_spectrum_terms(*self.given[method.float_type], self.shape, method)
+            found = factors(terms.rows, terms.columns, self.weights)
         return distance(found, self.reference) / self.scale
 
     def rayleigh_sommerfeld(self, method: PsfMethod) -> float:
         """Relative error of the direct sum, from a few pixels: no line shows where it aliases."""
-        few = [spread(count, _FEW) for count in self.shape]
+        rows, columns = (spread(count, _FEW) for count in self.shape)
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
-            points = SparseGrid(few[0], few[1], pitch)
+            mask, points, path = self.given["float64"]
+            points = SparseGrid(rows, columns, points.pitch)
             averaged = self.pixel_integration
             separable = PsfMethod("separable", "float64", averaged, nodes=self.nodes)
             exact = np.asarray(closed_terms(mask, points, path, separable).image())
         with allow(method.float_type):
-            mask, pitch, path = self.given[method.float_type]
-            points = SparseGrid(few[0], few[1], pitch)
+            mask, points, path = self.given[method.float_type]
+            points = SparseGrid(rows, columns, points.pitch)
             found = np.asarray(_direct_sum(mask, points, path, self.shape, method), float)
         share = exact.size / math.prod(self.shape)
         return float(np.linalg.norm(found - exact)) / math.sqrt(share) / self.scale
@@ -302,13 +272,13 @@ class MaskProbe:
     def numbers(self) -> "Numbers":
         """Sizes of the effects that the reasons name."""
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
+            mask, points, path = self.given["float64"]
             zones = getattr(mask, "zone_orders", None)
             epsilon, phase, radius = 0.0, 0.0, max(float(extent) for extent in mask.extent) / 2
             if zones is not None:
                 order, beta = max(abs(k) for k in zones().orders), zones().beta
                 epsilon, phase = order * float(path.epsilon(beta)), order * float(beta) * radius**2
-            reach = max(self.shape) * float(pitch) / 2 / float(path.magnification) + radius
+            reach = max(self.shape) * float(points.pitch) / 2 / float(path.magnification) + radius
             return Numbers(
                 epsilon=epsilon,
                 first_order=epsilon * phase,
@@ -332,9 +302,9 @@ class MaskProbe:
         The cross term of the two axes is left out: an estimate, not a bound.
         """
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
-            half_sensor, which = max(self.shape) * pitch / 2, map(jnp.asarray, (True, False))
-            found = [_fine_lines(mask, half_sensor, path, exact) for exact in which]
+            mask, points, path = self.given["float64"]
+            pitch, which = points.pitch, map(jnp.asarray, (True, False))
+            found = [_fine_lines(mask, max(self.shape) * pitch / 2, path, one) for one in which]
         exact, fresnel = (
             self._line_factors((fields[0], fields[-1]), float(reach), float(pitch), weighted_pairs)
             for fields, reach, weighted_pairs in jax.device_get(found)
@@ -350,11 +320,8 @@ class MaskProbe:
         half = round(pitch / step / 2) if self.pixel_integration else 0
         inside = np.unique(np.linspace(-half, half, _IN_PIXEL).round()).astype(int)
         picked = []
-        for field, indices in zip(fields, (self.lines.rows, self.lines.columns), strict=True):
+        for field, indices in zip(fields, self.lines, strict=True):
             position = np.round(indices * pitch / step + (count - 1) / 2).astype(int)
             found = field[:, np.clip(position[:, None] + inside, 0, count - 1)]
             picked.append(np.mean(found[lower] * found[upper].conj(), axis=-1))
-        lines = self.lines
-        return weighted(
-            weights[:, None] * picked[0], picked[1], lines.row_weights, lines.column_weights
-        )
+        return factors(weights[:, None] * picked[0], picked[1], self.weights)

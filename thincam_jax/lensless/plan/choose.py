@@ -1,6 +1,7 @@
 """The decisions of a plan: which model, which wavelengths, which planes."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Complex, Float
 
 from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax.lensless.accuracy.sampled import SAMPLED_ROUNDING, sampled_errors
+from thincam_jax.lensless.accuracy.select import until_met
 from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
 from thincam_jax.lensless.plan.transfer import SampledProbe, TransferProbe, image_spectrum
@@ -40,11 +42,9 @@ def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
     def work(method: PsfMethod) -> float:
         return seen.psf_cost(method).flops * (2.0 if method.precision == "float64" else 1.0)
 
-    for method in sorted(methods, key=work):
-        error = _method_error(seen, method)
-        if error <= tolerance:
-            return method, error
-    return FULL, 0.0
+    ordered = sorted(methods, key=work)
+    method, error = until_met(((m, _method_error(seen, m)) for m in ordered), tolerance)[-1]
+    return (method, error) if error <= tolerance else (FULL, 0.0)
 
 
 def _choose_samples(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
@@ -73,14 +73,10 @@ def _samples_at(
         return math.sqrt(float(np.sum(seen.power * np.abs(spectrum) ** 2)))
 
     mask, grid, path = seen.camera.mask, seen.kernel_grid, seen.camera.path(*corner)
-    tried: list[tuple[PsfMethod, float]] = []
     with allow(precision, mask, grid, path):
         mask, grid, path = cast((mask, grid, path), precision)
-        for method, error in sampled_errors(mask, grid, path, True, norm):
-            tried.append((method, seen.crop * error))
-            if tried[-1][1] <= tolerance:
-                break
-    return tried[-1]
+        found = sampled_errors(mask, grid, path, True, norm)
+        return until_met(((method, seen.crop * error) for method, error in found), tolerance)[-1]
 
 
 def _method_error(seen: SeenScene, method: PsfMethod) -> float:
@@ -107,18 +103,37 @@ def choose_wavelengths(
     columns = np.concatenate(
         [np.stack([_quick(seen, method, w, t) for w in seen.wavelengths], axis=-1) for t in some]
     )
-    parts = len(columns) // len(seen.power)
-    power = np.tile(np.sqrt(seen.power), parts)[:, None]
-    target = columns @ seen.weights
-    order = order_of_columns((columns * power)[::2])
-    for few in range(1, count):
+    target, light = (columns @ seen.weights)[:, None], np.sqrt(seen.power)[:, None]
+    found = _fewest(columns, target, light, lambda e: seen.relative_of_all(e[:, 0]), tolerance)
+    if found is None:
+        return list(range(count)), seen.weights, 0.0
+    picked, mixing, size = found
+    return picked, mixing[:, 0], size
+
+
+def _fewest(
+    columns: Complex[np.ndarray, "k n"],
+    targets: Complex[np.ndarray, "k target"],
+    light: Float[np.ndarray, "part target"],
+    size_of: Callable[[Complex[np.ndarray, "part target"]], float],
+    tolerance: float,
+) -> tuple[list[int], Float[np.ndarray, "few target"], float] | None:
+    """The fewest columns, mixed to the targets so that each part's error is within the tolerance.
+
+    None where it takes all. `light` weights the frequencies of each part of the columns.
+    """
+    parts = len(columns) // len(light)
+    light = np.tile(light, (parts, 1))
+    order = order_of_columns((columns * light)[::2])
+    for few in range(1, len(order)):
         picked = sorted(order[:few])
-        weights = fit((columns[:, picked] * power)[::2], (target * power[:, 0])[::2])
-        error = columns[:, picked] @ weights - target
-        size = max(seen.relative_of_all(part) for part in np.split(error, parts))
-        if size <= tolerance:
-            return picked, weights, size
-    return list(range(count)), seen.weights, 0.0
+        chosen = columns[:, picked]
+        weighted = zip(targets.T, light.T, strict=True)
+        mixing = [fit((chosen * w[:, None])[::2], (target * w)[::2]) for target, w in weighted]
+        errors = np.split(chosen @ np.stack(mixing, axis=-1) - targets, parts)
+        if (size := max(map(size_of, errors))) <= tolerance:
+            return picked, np.stack(mixing, axis=-1), size
+    return None
 
 
 def _quick(seen: SeenScene, method: PsfMethod, wavelength: float, distance: float):
@@ -156,24 +171,12 @@ def choose_planes(
     )
     area = np.sqrt(seen.frequencies.weights)
     light = np.sqrt(np.sum(np.abs(seen.spectra) ** 2, axis=1)).T * area[:, None]
-    parts = len(columns) // len(light)
-    light = np.tile(light, (parts, 1))
-    order = order_of_columns((columns * light)[::2])
-    for few in range(1, count):
-        picked = sorted(order[:few])
-        chosen = columns[:, picked]
-        mixing = np.stack(
-            [
-                fit((chosen * light[:, [p]])[::2], (columns[:, p] * light[:, p])[::2])
-                for p in range(count)
-            ],
-            axis=-1,
-        )
-        errors = np.split(chosen @ mixing - columns, parts)
-        size = max(seen.relative(np.einsum("kp,pbk->bk", e, seen.spectra)) for e in errors)
-        if size <= tolerance:
-            return picked, mixing, size
-    return list(range(count)), np.eye(count), 0.0
+
+    def size(error: Complex[np.ndarray, "k plane"]) -> float:
+        return seen.relative(np.einsum("kp,pbk->bk", error, seen.spectra))
+
+    every = list(range(count)), np.eye(count), 0.0
+    return _fewest(columns, columns, light, size, tolerance) or every
 
 
 def order_of_columns(columns: Complex[np.ndarray, "k n"]) -> list[int]:

@@ -6,7 +6,6 @@ at a few hundred random ones, closer together towards zero, where scenes have th
 shows how an error of the PSF shows in the image of this scene.
 """
 
-import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -15,12 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from thincam_jax._core.precision import allow, cast, product
+from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast, product
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
+
+Point = tuple[float, float] | None
+Transfer = Complex[np.ndarray, " k"]
 
 # Rings of frequencies, and frequencies in each.
 _RINGS, _IN_RING = 32, 16
@@ -103,56 +105,37 @@ class TransferProbe:
         self.places = [
             np.concatenate([i, np.zeros(n - len(i))]) for i, n in zip(indices, lengths, strict=True)
         ]
-        self.waves = [
-            waves(f, i, n)
-            for f, i, n in zip((frequencies.v, frequencies.u), indices, lengths, strict=True)
-        ]
+        both = zip((frequencies.v, frequencies.u), indices, lengths, strict=True)
+        found = [waves(*given) for given in both]
+        with allow("float64"):
+            self.waves = {p: tuple(jnp.asarray(w, p) for w in found) for p in PRECISIONS}
 
     def exact(
-        self,
-        wavelength: float,
-        distance: float,
-        method: PsfMethod,
-        at: tuple[float, float] | None = None,
-    ) -> Complex[np.ndarray, " k"]:
+        self, wavelength: float, distance: float, method: PsfMethod, at: Point = None
+    ) -> Transfer:
         """H with factors in the model's precision, transformed in double precision.
 
         `at`: a point on one of the mask's axes; H is then about the middle of its shadow.
         """
         with allow("float64"):
-            waves = self._double_waves
-            return self._transfer(waves, self._path(wavelength, distance, at), method)
-
-    @functools.cached_property
-    def _double_waves(self) -> tuple[Float[Array, "n k2"], ...]:
-        return tuple(jnp.asarray(w) for w in self.waves)
-
-    @functools.cached_property
-    def _single_waves(self) -> tuple[Float[Array, "n k2"], ...]:
-        return tuple(jnp.asarray(w, jnp.float32) for w in self.waves)
+            return self._transfer("float64", self._path(wavelength, distance, at), method)
 
     def quick(
-        self,
-        wavelength: float,
-        distance: float,
-        method: PsfMethod,
-        at: tuple[float, float] | None = None,
-    ) -> Complex[np.ndarray, " k"]:
+        self, wavelength: float, distance: float, method: PsfMethod, at: Point = None
+    ) -> Transfer:
         """H in single precision, with the nodes a pixel of `method`, for many PSFs."""
         method = replace(method, precision="float32")
-        return self._transfer(self._single_waves, self._path(wavelength, distance, at), method)
+        return self._transfer("float32", self._path(wavelength, distance, at), method)
 
-    def _path(
-        self, wavelength: float, distance: float, at: tuple[float, float] | None
-    ) -> LightPath:
+    def _path(self, wavelength: float, distance: float, at: Point) -> LightPath:
         path = self.camera.path(float(wavelength), float(distance), at)
         return path if at is None else replace(path, follows=True, skew=False)
 
-    def _transfer(self, waves_of, path: LightPath, method: PsfMethod) -> Complex[np.ndarray, " k"]:
+    def _transfer(self, precision: Precision, path: LightPath, method: PsfMethod) -> Transfer:
         given = self.camera.mask, self.camera.sensor.pitch, path
         mask, pitch, path = cast(given, method.float_type)
         points = SparseGrid(self.places[0], self.places[1], pitch)
-        return np.asarray(_transfer(mask, points, path, *waves_of, method), complex)
+        return np.asarray(_transfer(mask, points, path, *self.waves[precision], method), complex)
 
 
 class SampledProbe:
@@ -165,12 +148,8 @@ class SampledProbe:
         self.frequencies = frequencies
 
     def quick(
-        self,
-        wavelength: float,
-        distance: float,
-        method: PsfMethod,
-        at: tuple[float, float] | None = None,
-    ) -> Complex[np.ndarray, " k"]:
+        self, wavelength: float, distance: float, method: PsfMethod, at: Point = None
+    ) -> Transfer:
         """H of the PSF as a plan computes it; with `at`, about the ray of that point."""
         grid = self.camera.sensor.grid
         h = spectral_psf(self.camera, [(wavelength, 1.0)], distance, method, grid, at)
