@@ -16,7 +16,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers, Position
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, SparseGrid
 from thincam_jax._core.precision import (
     allow,
     as_complex,
@@ -28,7 +28,6 @@ from thincam_jax._core.precision import (
     turn_phasor,
 )
 from thincam_jax._core.progress import watched
-from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
 from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, as_method

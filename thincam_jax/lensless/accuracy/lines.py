@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from thincam_jax._core.grids import Grid, centred_frequencies, centred_indices
+from thincam_jax._core.grids import Grid, SparseGrid, centred_frequencies, centred_indices
 from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
@@ -29,44 +29,6 @@ from thincam_jax.lensless.propagation.separable import SeparableSum
 COUNT = 256
 # Share of them that may lie at the shadow's two edges, where the fields change fastest.
 _AT_EDGES = 0.5
-
-
-class SparseGrid(Grid):
-    """A grid's rows and columns at some of its indices; stands in for a grid in the models.
-
-    - `row_indices`, `column_indices`: i − (n−1)/2, exact.
-    """
-
-    row_indices: Float[Array, " rows"]
-    column_indices: Float[Array, " columns"]
-
-    def __init__(
-        self,
-        row_indices: Float[np.ndarray | Array, " rows"],
-        column_indices: Float[np.ndarray | Array, " columns"],
-        pitch: Float[Array, ""],
-    ):
-        self.shape = (len(row_indices), len(column_indices))
-        self.pitch = pitch
-        self.row_indices = jnp.asarray(row_indices, pitch.dtype)
-        self.column_indices = jnp.asarray(column_indices, pitch.dtype)
-
-    def refined(self, factor: int) -> "SparseGrid":
-        """The `factor` (odd) samples by `factor` of every pixel."""
-        inside = np.arange(factor) - factor // 2
-
-        def fine(indices):
-            return (indices[:, None] * factor + inside.astype(indices.dtype)).ravel()
-
-        return SparseGrid(fine(self.row_indices), fine(self.column_indices), self.pitch / factor)
-
-    @property
-    def y(self) -> Float[Array, " rows"]:
-        return self.row_indices * self.pitch
-
-    @property
-    def x(self) -> Float[Array, " columns"]:
-        return self.column_indices * self.pitch
 
 
 def chosen(

@@ -13,14 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
-from thincam_jax._core.grids import Grid, block_mean
+from thincam_jax._core.grids import Grid, SparseGrid, block_mean
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast, squared_modulus
-from thincam_jax.lensless.accuracy.lines import (
-    SparseGrid,
-    angular_spectrum_terms,
-    chosen,
-    fine_fields,
-)
+from thincam_jax.lensless.accuracy.lines import angular_spectrum_terms, chosen, fine_fields
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
@@ -129,7 +124,7 @@ class Factors:
 def factors(
     rows: Complex[ArrayLike, "term row"], columns: Complex[ArrayLike, "term column"], weights: Both
 ) -> Factors:
-    """Those of Σ Re{Y X} whose samples stand for `weights` samples each."""
+    """Factors of Σ Re{Y X} whose samples stand for `weights` samples each."""
     both = zip((rows, columns), weights, strict=True)
     down, across = (np.asarray(factor, complex) * np.sqrt(weight) for factor, weight in both)
     # Re{YX} = Re Y Re X − Im Y Im X.
