@@ -8,8 +8,14 @@ import pytest
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax._core.grids import Grid, SparseGrid
-from thincam_jax.lensless.accuracy.lines import COUNT, chosen
-from thincam_jax.lensless.accuracy.probe import distance, factors, norm, rounding_distance
+from thincam_jax.lensless.accuracy.probe import (
+    COUNT,
+    chosen,
+    distance,
+    factors,
+    norm,
+    rounding_distance,
+)
 from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.lensless.propagation.separable import SeparableSum
 from thincam_jax.units import nm, um
