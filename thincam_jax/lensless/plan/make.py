@@ -60,13 +60,9 @@ def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
     if isinstance(seen.probe, SampledProbe):
         return _choose_samples(seen, tolerance)
     # Double precision is for where single cannot serve: a cheaper model would not help there.
-    methods = [
-        PsfMethod(model, "float32", average)
-        for model in seen.models
-        for average in (False, True)
-        if seen.held_in_single(model)
-    ]
-    methods += [PsfMethod("separable", "float64", average) for average in (False, True)]
+    both = (False, True)
+    methods = [PsfMethod(m, "float32", average) for m in seen.models for average in both]
+    methods += [PsfMethod("separable", "float64", average) for average in both]
     if _method_error(seen, PsfMethod("separable", "float32", False)) > max(tolerance, 1e-3):
         methods = [method for method in methods if method.pixel_integration]
 

@@ -296,13 +296,10 @@ class SeenScene:
 
     @property
     def models(self) -> tuple[Model, ...]:
-        """Closed forms that can represent the mask."""
-        return tuple(m for m in models_of(self.camera.mask) if m in CLOSED)
-
-    def held_in_single(self, model: str) -> bool:
-        """Whether float32 can represent the zones' phases on the kernel's grid for every plane."""
-        path = self.camera.path(min(self.wavelengths), max(self.distances))
-        return held_in_single(self.camera.mask, self.kernel_grid, path, model)
+        """Closed forms that can represent the mask, and float32 its phases in every plane."""
+        mask, path = self.camera.mask, self.camera.path(min(self.wavelengths), max(self.distances))
+        closed = (model for model in models_of(mask) if model in CLOSED)
+        return tuple(m for m in closed if held_in_single(mask, self.kernel_grid, path, m))
 
     @property
     def edge_wave(self) -> float:
