@@ -113,7 +113,7 @@ def choose_model(
 
     **See also**: `predict_error`, `plan_capture`, `psf`.
     """
-    tolerance = tolerance_of(tolerance)
+    tolerance = checks.relative_tolerance(tolerance)
     mask, grid = camera.mask, camera.sensor.grid
     if has_few_terms(mask):
         probe = probe_of(camera, wavelength, object_distance, pixel_integration)
@@ -255,14 +255,6 @@ def _require_known(numbers) -> None:
         raise TypeError(
             "the choice of a model needs known numbers: make it outside of jit and grad"
         )
-
-
-def tolerance_of(tolerance: float) -> float:
-    """A relative error, at most 1."""
-    tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
-    if tolerance > 1:
-        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
-    return tolerance
 
 
 def probe_of(

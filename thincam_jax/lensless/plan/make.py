@@ -26,7 +26,7 @@ from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.sampled import SAMPLED_ROUNDING, sampled_errors
-from thincam_jax.lensless.accuracy.select import tolerance_of, until_met
+from thincam_jax.lensless.accuracy.select import until_met
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import light_over_field, points_needed, tangents_of
 from thincam_jax.lensless.masks.base import (
@@ -380,7 +380,7 @@ def plan_capture(
 
     **See also**: `choose_model`, `capture`.
     """
-    tolerance = tolerance_of(tolerance)
+    tolerance = checks.relative_tolerance(tolerance)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
         raise TypeError("plan_capture needs known numbers: call it outside of jit and grad")
     seen = SeenScene(camera, scene, tolerance)

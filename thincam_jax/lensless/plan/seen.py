@@ -298,7 +298,7 @@ class SeenScene:
     def models(self) -> tuple[Model, ...]:
         """Closed forms that can represent the mask, and float32 its phases in every plane."""
         mask, path = self.camera.mask, self.camera.path(min(self.wavelengths), max(self.distances))
-        closed = (model for model in models_of(mask) if model in CLOSED)
+        closed: list[Model] = [m for m in models_of(mask) if m in CLOSED]
         return tuple(m for m in closed if held_in_single(mask, self.kernel_grid, path, m))
 
     @property
