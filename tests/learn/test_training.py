@@ -163,12 +163,6 @@ def killed_and_resumed(file, checks, delay):
 
 
 @pytest.mark.thorough
-def test_a_killed_process_goes_on_to_the_same_bits(tmp_path):
-    whole = train_model(TASK, MODEL, OPTIONS).state
-    assert eqx.tree_equal(killed_and_resumed(tmp_path / "state", 2, 0.02), whole)
-
-
-@pytest.mark.thorough
 def test_a_process_killed_at_twenty_moments_goes_on_to_the_same_bits(tmp_path):
     whole, moments = train_model(TASK, MODEL, OPTIONS).state, random.Random(3)
     for number in range(20):

@@ -162,8 +162,6 @@ def check_gradient(model, rtol, zero=(), **options):
         # The mask has no edge.
         pytest.param("paraxial", ("width",), marks=pytest.mark.thorough),
         ("closed_form", ("width",)),
-        # Its differences are those of tests/test_extremes.py, too.
-        pytest.param("separable", (), marks=pytest.mark.thorough),
     ],
 )
 def test_gradients_of_the_closed_forms(model, zero):

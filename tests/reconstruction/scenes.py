@@ -4,9 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tifffile
 
-from helpers import shared_data
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.reconstruction.problem import InverseProblem
@@ -112,22 +110,3 @@ def rescaled(problem: InverseProblem, factor: float) -> InverseProblem:
     captures = tuple(c * jnp.asarray(factor, c.dtype) for c in problem.captures)
     tau = problem.tau * jnp.asarray(factor, problem.tau.dtype)
     return eqx.tree_at(lambda p: (p.captures, p.tau), problem, (captures, tau))
-
-
-def hand(bin_by):
-    """The measured capture of a hand through a diffuser, and its PSF, binned."""
-    folder = shared_data("diffusercam-hand")
-    psf, raw = (
-        tifffile.imread(folder / name).astype(float)
-        for name in ("psf_sample.tif", "rawdata_hand_sample.tif")
-    )
-    dark = psf[5:15, 5:15].mean()
-    rows, columns = (n // bin_by for n in psf.shape)
-    psf, raw = (
-        np.maximum(i - dark, 0)
-        .reshape(rows, bin_by, columns, bin_by)
-        .mean((1, 3))
-        .astype(np.float32)
-        for i in (psf, raw)
-    )
-    return raw, psf / psf.sum()

@@ -10,8 +10,7 @@ import optimistix
 import pytest
 from reconstruction import extremes, scenes
 
-from helpers import compilations, relative_l2
-from thincam_jax.reconstruction.iterate import Schedule, iterate
+from helpers import compilations
 from thincam_jax.reconstruction.problem import total_misfit, total_objective
 from thincam_jax.reconstruction.proximal_gradient import (
     AcceleratedProximalGradient,
@@ -21,25 +20,12 @@ from thincam_jax.reconstruction.proximal_gradient import (
 )
 from thincam_jax.reconstruction.regularisers import Sparsity, Wavelet
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
-from thincam_jax.reconstruction.splittings import admm_method
 
 few = functools.partial(solve_fista, iterations=10)
 
 
 def zeros(problem):
     return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
-
-
-@pytest.mark.thorough
-def test_it_finds_the_minimum_that_admm_finds():
-    problem, truth = scenes.problem((12, 14), (8, 9), kernel=scenes.spots)
-    settings = {"iterations": 600, "tolerance": 1e-7}
-    admm = iterate(admm_method(problem), zeros(problem), Schedule(adapt_until=200, **settings))
-    found = solve_fista(problem, **settings)
-    assert admm.status == found.status == "converged"
-    assert found.history[-1].objective == pytest.approx(admm.history[-1].objective, rel=1e-6)
-    assert relative_l2(found.image, admm.image) < 1e-5
-    assert relative_l2(found.image, truth) < 0.6 * relative_l2(zeros(problem) + truth.mean(), truth)
 
 
 def test_the_minimum_in_closed_form_of_one_pixel_that_is_seen_by_itself():

@@ -265,6 +265,14 @@ def positive(
     return _require(array, lambda known: (known >= _LEAST) & (known <= most), message)
 
 
+def relative_tolerance(tolerance: float) -> float:
+    """A relative error, at most 1."""
+    tolerance = float(positive("tolerance", tolerance, "parts of one"))
+    if tolerance > 1:
+        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
+    return tolerance
+
+
 def non_negative(name: str, value: Any, unit: str) -> Checked:
     message = f"{name} = {{}}{_after(unit)} is negative; give {name} >= 0{_within(unit)}"
     return _require(finite(name, value, unit), lambda known: known >= 0, message)

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import scipy
 from jaxtyping import Array, DTypeLike, Float
 
@@ -62,6 +63,44 @@ class Grid(eqx.Module):
     def with_shape(self, shape: tuple[int, int]) -> "Grid":
         """Grid of this pitch with another number of samples."""
         return Grid(shape, self.pitch)
+
+
+class SparseGrid(Grid):
+    """A grid's rows and columns at some of its indices; stands in for a grid in the models.
+
+    - `row_indices`, `column_indices`: i − (n−1)/2, exact.
+    """
+
+    row_indices: Float[Array, " rows"]
+    column_indices: Float[Array, " columns"]
+
+    def __init__(
+        self,
+        row_indices: Float[np.ndarray | Array, " rows"],
+        column_indices: Float[np.ndarray | Array, " columns"],
+        pitch: Float[Array, ""],
+    ):
+        self.shape = (len(row_indices), len(column_indices))
+        self.pitch = pitch
+        self.row_indices = jnp.asarray(row_indices, pitch.dtype)
+        self.column_indices = jnp.asarray(column_indices, pitch.dtype)
+
+    def refined(self, factor: int) -> "SparseGrid":
+        """The `factor` (odd) samples by `factor` of every pixel."""
+        inside = np.arange(factor) - factor // 2
+
+        def fine(indices):
+            return (indices[:, None] * factor + inside.astype(indices.dtype)).ravel()
+
+        return SparseGrid(fine(self.row_indices), fine(self.column_indices), self.pitch / factor)
+
+    @property
+    def y(self) -> Float[Array, " rows"]:
+        return self.row_indices * self.pitch
+
+    @property
+    def x(self) -> Float[Array, " columns"]:
+        return self.column_indices * self.pitch
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

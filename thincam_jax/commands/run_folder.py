@@ -137,13 +137,20 @@ class RunFolder:
 
     def finished(self, target: str) -> dict[str, Any] | None:
         """The stored results of a target; None if it has not been finished or is damaged."""
-        held = read_entries(self.path / "targets" / f"{slug(target)}.json")
-        return held if held.pop(_SUM, None) == digest(to_json(held)) else None
+        return self.entries(f"targets/{slug(target)}.json")
 
     def finish(self, target: str, results: dict[str, Any]) -> None:
-        """Store the results of a target, with their sum."""
-        summed = {**results, _SUM: digest(to_json(results))}
-        self.write(f"targets/{slug(target)}.json", to_json(summed))
+        """Store the results of a target."""
+        self.write_entries(f"targets/{slug(target)}.json", results)
+
+    def entries(self, name: str) -> dict[str, Any] | None:
+        """Entries that `write_entries` wrote; None where the file is missing or damaged."""
+        held = read_entries(self.path / name)
+        return held if held.pop(_SUM, None) == digest(to_json(held)) else None
+
+    def write_entries(self, name: str, entries: dict[str, Any]) -> None:
+        """Write entries with their sum."""
+        self.write(name, to_json({**entries, _SUM: digest(to_json(entries))}))
 
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file of the folder, whole or not at all."""

@@ -52,7 +52,7 @@ from thincam_jax.design.space import DesignSpace
 def ring_levels(known: Channels, frequencies: Frequencies, rings: int) -> Float[Array, " ring"]:
     """10·log₁₀(1 + signal-to-noise ratio) of rings of equal width, dB, from zero frequency up."""
     # log1p keeps the digits of rings deep in the noise, and has a slope there.
-    return _decibels(jnp.log1p(ring_means(known, frequencies, rings)))
+    return (10 / np.log(10.0)) * jnp.log1p(ring_means(known, frequencies, rings))
 
 
 @checked
@@ -66,10 +66,6 @@ def response_misfit(
 def root_mean_square(difference: Float[Array, " ring"]) -> Float[Array, ""]:
     """Root mean square over the rings, with a slope of 0, not NaN, where all is 0."""
     return jnp.sqrt(jnp.mean(difference**2) + jnp.finfo(difference.dtype).eps ** 2)
-
-
-def _decibels(natural: Float[Array, " ring"]) -> Float[Array, " ring"]:
-    return natural * (10 / np.log(10.0))
 
 
 @checked

@@ -406,11 +406,6 @@ def _normal(
     return normal_equations(problem, shift)
 
 
-def _signs(normal: AbstractNormal) -> Image:
-    shape, dtype = normal.problem.image_shape, normal.problem.captures[0].dtype
-    return jax.random.rademacher(jax.random.key(0), shape, dtype)
-
-
 @eqx.filter_jit
 def data_step(
     normal: AbstractNormal,
@@ -423,7 +418,8 @@ def data_step(
     normal = normal.shifted(shift)
     if not isinstance(normal, IterativeNormal):
         return normal.solve(right + shift * image)
-    signs = _signs(normal)
+    shape, dtype = normal.problem.image_shape, normal.problem.captures[0].dtype
+    signs = jax.random.rademacher(jax.random.key(0), shape, dtype)
     noise = jnp.sqrt(jnp.mean(signs * (normal.applied(signs) - shift * signs)) / precision)
     change = right + shift * image - normal.applied(image)
     size = or_one(jnp.sqrt(jnp.mean(change**2)))

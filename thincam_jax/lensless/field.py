@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -181,7 +180,8 @@ def field_fit(
     assert method.field_tolerance is not None
     tolerance, tangents = method.field_tolerance, tangents_of(camera, field_shape)
     sensor, grid = camera.sensor, kernel_grid(camera.sensor.grid, field_shape)
-    aside = _aside(camera, object_distance)
+    place = camera.place  # a camera beside the scene's axis sees it turned
+    aside = (0.0, 0.0) if place is None else np.asarray(place / object_distance)
     fall = light_over_field(sensor, *(t + n for t, n in zip(tangents, aside, strict=True)))
     if tolerance >= 1:
         own = spectral_psf(camera, colours, object_distance, method, grid)
@@ -214,11 +214,6 @@ def field_fit(
     convolution = CropConvolution(kernels, sensor.pitch, sensor.shape, field_shape, summed=1)
     found = LowRank(jnp.asarray(weights, kernels.dtype), convolution)
     return LowRankFit(found, error, between)
-
-
-def _aside(camera: LenslessCamera, object_distance: Number) -> Any:
-    """Tangents (y, x) by which a camera beside the scene's axis sees it turned."""
-    return (0.0, 0.0) if camera.place is None else np.asarray(camera.place / object_distance)
 
 
 def _averages(

@@ -16,7 +16,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers, Position
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, SparseGrid
 from thincam_jax._core.precision import (
     allow,
     as_complex,
@@ -28,9 +28,8 @@ from thincam_jax._core.precision import (
     turn_phasor,
 )
 from thincam_jax._core.progress import watched
-from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
-from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms, require_factored
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, has_few_terms
 from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
@@ -101,8 +100,7 @@ def psf(
 
     **See also**: `otf`, `choose_model`, `capture`.
     """
-    path = camera.path(wavelength, object_distance, at)
-    return _computed(_psf, camera, path, model, pixel_integration)
+    return _computed(_psf, camera, (wavelength, object_distance, at), model, pixel_integration)
 
 
 def psf_about_ray(
@@ -113,8 +111,8 @@ def psf_about_ray(
     method: PsfMethod,
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
-    path = replace(camera.path(wavelength, object_distance, at), follows=at is not None)
-    return _computed(_psf, camera, path, method)
+    light = wavelength, object_distance, at
+    return _computed(_psf, camera, light, method, follows=at is not None)
 
 
 def spectral_psf(
@@ -164,8 +162,7 @@ def otf(
 
     **See also**: `psf`, `lensless.phase_shift.fringe_scanned_otf`.
     """
-    path = camera.path(wavelength, object_distance, at)
-    return _computed(_otf, camera, path, model, pixel_integration)
+    return _computed(_otf, camera, (wavelength, object_distance, at), model, pixel_integration)
 
 
 @checked
@@ -210,8 +207,7 @@ def mtf(
     if not checks.holds_traced(rho, grid.pitch):
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
-    path = camera.path(wavelength, object_distance)
-    h = _computed(_psf, camera, path, model, pixel_integration)
+    h = _computed(_psf, camera, (wavelength, object_distance), model, pixel_integration)
     return _contrast(h, grid, rho)
 
 
@@ -243,7 +239,8 @@ def _irradiance(
         if method.model == "separable" and path.skew:
             return skew_image(mask, grid, path, nodes=nodes)
         if method.model == "separable" and not has_few_terms(mask):
-            return separable_image(require_factored(mask, "separable"), grid, path, nodes=nodes)
+            assert isinstance(mask, AbstractFactoredMask)  # by `resolve`
+            return separable_image(mask, grid, path, nodes=nodes)
         if method.model == "radial":
             return radial(mask, grid, path, method)
         return _closed(mask, grid, path, method)
@@ -258,6 +255,7 @@ def _closed(
     if model == "geometric":
         return geometric(mask, grid, path, pixel_integration=average)
     if model == "separable":
+        assert isinstance(mask, AbstractFactoredMask)  # by `resolve`
         nodes = method.nodes or PIXEL_NODES
         return separable(mask, grid, path, pixel_integration=average, nodes=nodes)
     return paraxial(mask, path) if model == "paraxial" else closed_form(mask, path)
@@ -298,11 +296,15 @@ def _otf(mask, grid: Grid, path, method):
 def _computed(
     function,
     camera: LenslessCamera,
-    path: LightPath,
+    light: tuple[Any, ...],
     model: Model | PsfMethod,
     pixel_integration: bool = True,
+    *,
+    follows: bool = False,
 ):
-    """`function` of what `resolve` gives, in the camera's precision."""
+    """`function` of what `resolve` gives for the path of light, in the camera's precision."""
+    path = camera.path(*light)
+    path = replace(path, follows=True) if follows else path
     if path.at is None and path.place is not None and as_method(model).model in SAMPLED:
         path = replace(path, at=jnp.zeros_like(path.place))  # these follow the ray
     mask, grid, path, method = resolve(camera, path, model, pixel_integration)

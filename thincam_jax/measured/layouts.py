@@ -116,7 +116,9 @@ def open_pairs(
     if not len(found):
         raise MeasurementError(f"{path}: its split {found.split!r} has no pairs")
     psfs = {None: psf} if (psf := image_beside(root, _PSFS)) else {}
-    known = next((PUBLISHED[n] for n in reversed(_repositories(root)) if n in PUBLISHED), None)
+    # A folder of a cache is named datasets--OWNER--NAME.
+    above = (part.split("--")[-1] for part in reversed(root.resolve().parts))
+    known = next((PUBLISHED[name] for name in above if name in PUBLISHED), None)
     notes = found.notes
     if not psfs:
         masks = ", only patterns of masks" if (root / "masks").is_dir() else ""
@@ -286,11 +288,6 @@ def _content(path: Path) -> str:
     others = [entry.name for entry in entries if not entry.is_dir()]
     names = shortened(", ".join([*folders, *others]) or "nothing")
     return f"holds {len(folders)} folders and {len(others)} files ({names})"
-
-
-def _repositories(root: Path) -> list[str]:
-    """Names of the folders above, of repositories: datasets--OWNER--NAME is one of a cache."""
-    return [part.split("--")[-1] for part in root.resolve().parts]
 
 
 def _licence(root: Path) -> str:

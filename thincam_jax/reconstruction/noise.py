@@ -132,7 +132,9 @@ def estimate_noise(
     key = jax.random.key(0)
     spread = jax.random.uniform(key, detail.shape[-1:], detail.dtype, -0.5, 0.5)
     detail = jnp.abs(detail + spread * step[..., None])
-    light, rounding = _brightness(windows), step**2 / 12
+    # The median of the rows' medians, which a dead pixel does not move.
+    light = _middle(*(_middle(*windows[i : i + 3]) for i in (0, 3, 6)))
+    rounding = step**2 / 12
     # What is not black, and what is: at once, for sorting takes long to compile.
     parts = jnp.stack([shown & ~black, shown & black])
     details = jnp.broadcast_to(detail, parts.shape)
@@ -189,11 +191,6 @@ def _windows(image: Array) -> Array:
     n = _stride(image)
     parts = [image[..., i : i + rows : n, j : j + columns : n] for i in range(3) for j in range(3)]
     return jnp.stack(parts).reshape(9, *image.shape[:-2], -1)
-
-
-def _brightness(windows: Float[Array, "9 *batch n"]) -> Float[Array, "*batch n"]:
-    """The median of the rows' medians, which a dead pixel does not move."""
-    return _middle(*(_middle(*windows[i : i + 3]) for i in (0, 3, 6)))
 
 
 def _middle(a: Array, b: Array, c: Array) -> Array:

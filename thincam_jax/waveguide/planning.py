@@ -133,9 +133,7 @@ def plan_screen(
     **Errors**: ValueError for a tolerance that is not between 0 and 1 and where no light arrives;
     TypeError for traced numbers and for a scene that is no `LitPlane` and holds others.
     """
-    tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
-    if tolerance > 1:
-        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
+    tolerance = checks.relative_tolerance(tolerance)
     lit = (scene,) if isinstance(scene, LitPlane) else tuple(scene)
     for one in lit:
         if not isinstance(one, LitPlane):

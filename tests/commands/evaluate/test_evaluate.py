@@ -76,7 +76,7 @@ def done(monkeypatch):
             yield name, function(*given)
 
     work = lambda *_: contextlib.nullcontext(outcomes)  # noqa: E731
-    monkeypatch.setattr(run, "local_workers", work)
+    monkeypatch.setattr(run, "workers_of", work)
     outcomes.stop, outcomes.tasks = stop, tasks
     return outcomes
 

@@ -45,7 +45,7 @@ def at_once(monkeypatch):
             done.append(key)
             yield key, results.get(key, mini.outcome(1))
 
-    monkeypatch.setattr(run, "local_workers", lambda *_: contextlib.nullcontext(outcomes))
+    monkeypatch.setattr(run, "workers_of", lambda *_: contextlib.nullcontext(outcomes))
     return results, done
 
 

@@ -14,9 +14,8 @@ from thincam_jax.imaging.operators.base import adjoint_error, is_shape
 KINDS = pytest.mark.parametrize("name", NAMES)
 # A convolution, several terms, a sparse matrix, and operators within operators.
 FEW = pytest.mark.parametrize("name", quick(NAMES, 0, 3, 4, 10))
-error_of_adjoint = eqx.filter_jit(
-    adjoint_error
-)  # one program for an operator, not one for each step
+# One program for an operator, not one for each step.
+error_of_adjoint = eqx.filter_jit(adjoint_error)
 
 
 MISTAKES = ("sign", "factor", "shifted", "turned", "zero", "nan")

@@ -1,12 +1,11 @@
 """Crop-convolution against direct sums, its adjoint, its gradients; nothing wraps round."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import finite_difference, quick
+from helpers import quick
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid, kernel_shape
@@ -38,7 +37,6 @@ def operator(kernel, sensor, field, pitch=PITCH):
 
 compiled = eqx.filter_jit(CropConvolution)
 seen = eqx.filter_jit(lambda convolution, field: convolution(field))
-back = eqx.filter_jit(lambda convolution, capture: convolution.adjoint(capture))
 
 
 @pytest.mark.parametrize(("sensor", "field"), quick(SHAPES, 1, 2, 4))
@@ -57,19 +55,6 @@ def test_it_is_the_integral_over_the_field(sensor, field):
     np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-14)
 
 
-@pytest.mark.parametrize(("sensor", "field"), quick(SHAPES, 2))
-def test_adjoint(sensor, field):
-    """⟨A f, g⟩ = ⟨f, A* g⟩."""
-    convolution = operator(numbers(kernel_shape(sensor, field)), sensor, field)
-    f, g = jnp.asarray(numbers(field, 1)), jnp.asarray(numbers(sensor, 2))
-    adjoint = back(convolution, g)
-    forward, backward = np.vdot(seen(convolution, f), g), np.vdot(f, adjoint)
-    np.testing.assert_allclose(forward, backward, rtol=1e-12, atol=1e-15)
-    # and it is the transpose that JAX derives
-    transposed = jax.jit(lambda g: jax.linear_transpose(convolution, f)(g)[0])(g)
-    np.testing.assert_allclose(adjoint, transposed, atol=1e-15)
-
-
 @pytest.mark.parametrize("corner", [(0, 0), (0, -1), (-1, 0), (-1, -1)])
 def test_nothing_wraps_round(corner):
     """A bright pixel in the field's corner, on a sensor as large, with the smallest window."""
@@ -83,40 +68,3 @@ def test_nothing_wraps_round(corner):
     expected[row : row + 3, column : column + 3] = kernel[4:7, 7:10]
     value = seen(operator(kernel, sensor, field, pitch=1.0), jnp.asarray(f))
     np.testing.assert_allclose(value, expected[1:-1, 1:-1], atol=1e-14)
-
-
-def test_gradients():
-    """Linear in the kernel and in the field, quadratic in the pitch: any step will do."""
-    sensor, field = (4, 7), (9, 6)
-    weights = jnp.asarray(numbers(sensor, 3))
-
-    def loss(kernel, pitch, f):
-        return jnp.sum(weights * CropConvolution(kernel, pitch, sensor, field)(f))
-
-    at = (
-        jnp.asarray(numbers(kernel_shape(sensor, field))),
-        jnp.asarray(PITCH),
-        jnp.asarray(numbers(field, 1)),
-    )
-    compiled = jax.jit(loss)
-    slopes = jax.jit(jax.grad(loss, (0, 1, 2)))(*at)
-    for argument, (point, slope) in enumerate(zip(at, slopes, strict=True)):
-        direction = [jnp.zeros_like(a) for a in at]
-        direction[argument] = jnp.asarray(numbers(point.shape, 4))
-        expected = finite_difference(lambda a: compiled(*a), at, tuple(direction), 1e-2)
-        np.testing.assert_allclose(np.vdot(slope, direction[argument]), expected, rtol=1e-9)
-
-
-def test_a_kernel_that_does_not_cover_the_differences():
-    with pytest.raises(ValueError, match=r"kernel has shape \(6, 9\).*\(8, 12\).*kernel_grid"):
-        operator(np.ones((6, 9)), (6, 9), (3, 4))
-
-
-def test_a_field_or_capture_of_another_shape():
-    """Larger would be cut and smaller shifted, in silence."""
-    convolution = operator(np.ones((8, 12)), (6, 9), (3, 4))
-    for shape in ((4, 3), (3, 5), (2, 2)):
-        with pytest.raises(ValueError, match=r"field has shape .*= \(3, 4\)"):
-            convolution(jnp.ones(shape))
-        with pytest.raises(ValueError, match=r"capture has shape .*= \(6, 9\)"):
-            convolution.adjoint(jnp.ones(shape))

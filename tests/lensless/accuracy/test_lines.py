@@ -7,9 +7,15 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax._core.grids import Grid
-from thincam_jax.lensless.accuracy.lines import COUNT, SparseGrid, chosen
-from thincam_jax.lensless.accuracy.probe import distance, factors, norm, rounding_distance
+from thincam_jax._core.grids import Grid, SparseGrid
+from thincam_jax.lensless.accuracy.probe import (
+    COUNT,
+    chosen,
+    distance,
+    factors,
+    norm,
+    rounding_distance,
+)
 from thincam_jax.lensless.masks.phase import MaskBlank, diffuser, voronoi_fresnel
 from thincam_jax.lensless.propagation.separable import SeparableSum
 from thincam_jax.units import nm, um
@@ -95,7 +101,7 @@ def test_points_are_those_of_the_grid(factor):
 
 
 SHAPE = (17, 23)
-ONES = [np.ones(n) for n in SHAPE]
+ONES = tuple(np.ones(n) for n in SHAPE)
 
 
 def random_terms(seed, count=4):
@@ -122,7 +128,7 @@ def image(terms):
 
 def test_norm_and_distance():
     first, second = random_terms(1), random_terms(2, count=6)
-    given = [factors(terms, *ONES) for terms in (first, second)]
+    given = [factors(terms.rows, terms.columns, ONES) for terms in (first, second)]
     assert norm(given[0]) == pytest.approx(np.linalg.norm(image(first)), rel=1e-13)
     expected = np.linalg.norm(image(first) - image(second))
     assert distance(*given) == pytest.approx(expected, rel=1e-13)
@@ -132,9 +138,9 @@ def test_norm_and_distance():
 def test_weights_repeat_rows_and_columns():
     """A weight of n is n equal rows; a weight of zero is none."""
     terms = random_terms(3)
-    weights = [np.random.default_rng(n).integers(0, 4, n) for n in SHAPE]
+    weights = tuple(np.random.default_rng(n).integers(0, 4, n) for n in SHAPE)
     repeated = np.repeat(np.repeat(image(terms), weights[0], axis=0), weights[1], axis=1)
-    given = factors(terms, *(w.astype(float) for w in weights))
+    given = factors(terms.rows, terms.columns, tuple(w.astype(float) for w in weights))
     assert norm(given) == pytest.approx(np.linalg.norm(repeated), rel=1e-13)
 
 
@@ -143,7 +149,7 @@ def test_distance_of_nearly_equal_sums(size):
     """Right in all sizes, where the distance of the images' norms has long lost its digits."""
     first = random_terms(4)
     second = moved(first, size)
-    given = [factors(terms, *ONES) for terms in (second, first)]
+    given = [factors(terms.rows, terms.columns, ONES) for terms in (second, first)]
     rows, columns = (np.asarray(v) for v in (first.rows, first.columns))
     down, across = (np.asarray(v) - w for v, w in ((second.rows, rows), (second.columns, columns)))
     # The differences of the factors are exact, so that those of the images keep their digits too.

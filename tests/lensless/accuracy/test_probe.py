@@ -12,8 +12,7 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.accuracy import probe as probe_module
-from thincam_jax.lensless.accuracy.lines import fine_fields
-from thincam_jax.lensless.accuracy.probe import MaskProbe
+from thincam_jax.lensless.accuracy.probe import MaskProbe, fine_fields
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable

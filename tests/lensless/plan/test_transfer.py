@@ -7,12 +7,12 @@ from lensless.plan.scenes import camera
 
 import thincam_jax as tc
 from thincam_jax.lensless.method import CLOSED, PsfMethod, models_of
-from thincam_jax.lensless.plan.choose import fit, order_of_columns
-from thincam_jax.lensless.plan.seen import crop_factor
-from thincam_jax.lensless.plan.transfer import (
+from thincam_jax.lensless.plan.make import fit, order_of_columns
+from thincam_jax.lensless.plan.seen import (
     TransferProbe,
     _rounded_up,
     centred,
+    crop_factor,
     image_spectrum,
     sample_frequencies,
     waves,

@@ -78,22 +78,6 @@ def chirp_by_quadrature(g, b, x, lower, upper):
     return complex(np.sum(np.exp(1j * turned) @ weights) * float(half))
 
 
-def psf_by_quadrature(y, x, *, beta, phase, width, distance, wavelength, object_distance):
-    """The PSF of the cosine profile from mpmath quadratures, one for each order and coordinate."""
-    b = math.pi / (wavelength * distance)
-    s = math.pi / (wavelength * object_distance)
-    magnification = 1 + distance / object_distance
-
-    def axis(k, points):
-        values = [chirp_by_quadrature(k * beta + s, b, p, -width / 2, width / 2) for p in points]
-        return np.asarray(values) * np.sqrt(magnification / (wavelength * distance))
-
-    field = sum(
-        c * np.exp(1j * k * phase) * np.outer(axis(k, y), axis(k, x)) for k, c in COSINE.items()
-    )
-    return np.abs(field) ** 2
-
-
 def centred(count, pitch):
     """Pixel centres (i − (n−1)/2)·pitch."""
     return (np.arange(count) - (count - 1) / 2) * pitch

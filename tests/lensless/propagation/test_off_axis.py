@@ -9,8 +9,8 @@ import pytest
 
 import thincam_jax as tc
 from helpers import count_traces, point_psf
+from thincam_jax._core.grids import SparseGrid
 from thincam_jax._core.precision import cast
-from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.masks import random_cells
 from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask

@@ -7,26 +7,7 @@ import typer
 from typer import Argument, Option
 
 from thincam_jax.commands.reconstruct import METHODS
-from thincam_jax.commands.reconstruct.command import (
-    Background,
-    Bayer,
-    Bits,
-    Blocks,
-    Corner,
-    Coupling,
-    Dead,
-    Demosaicing,
-    Iterations,
-    Noise,
-    PsfBackground,
-    PsfBits,
-    PsfScale,
-    Ridge,
-    Saturation,
-    Strict,
-    Tau,
-    Threshold,
-)
+from thincam_jax.commands.reconstruct.command import Bits, ImageOptions, SolverOptions, grouped
 from thincam_jax.commands.sweep.command import Scheduler, Workers, check_workers
 from thincam_jax.commands.terminal import (
     WRONG_INPUT,
@@ -60,6 +41,7 @@ def info(path: DataSet, split: Split = None, bits: Bits = None) -> None:
     show(table)
 
 
+@grouped
 def evaluate(
     path: DataSet,
     method: Annotated[
@@ -78,28 +60,13 @@ def evaluate(
         Path | None,
         Option(help="PSF, or a folder of one for each mask. Default: that beside the captures."),
     ] = None,
-    background: Background = None,
-    psf_background: PsfBackground = None,
-    dead: Dead = None,
-    bits: Bits = None,
-    psf_bits: PsfBits = None,
-    bayer: Bayer = None,
-    demosaic: Demosaicing = "bilinear",
-    downsample: Blocks = 1,
-    corner: Corner = "5:15",
-    psf_scale: PsfScale = None,
+    *,
+    files: ImageOptions,
     psf_channels: Annotated[
         Literal["each", "mean"] | None,
         Option(help="each: one PSF for each colour; mean: their mean. Default: as published."),
     ] = None,
-    saturation: Saturation = None,
-    noise_threshold: Threshold = None,
-    tau: Tau = None,
-    ridge: Ridge = None,
-    coupling: Coupling = None,
-    iterations: Iterations = None,
-    noise: Noise = None,
-    strict: Strict = False,
+    solver: SolverOptions,
     truth: Truth = None,
     truth_area: Area = None,
     flip: Annotated[bool, Option("--flip", help="Turn images by 180° before.")] = False,
@@ -140,41 +107,26 @@ def evaluate(
             tasks_of,
         )
         from thincam_jax.commands.reconstruct import options
-        from thincam_jax.measured import Preparation
         from thincam_jax.measured.layouts import open_pairs
         from thincam_jax.studies.agreement import scores_table
 
         if limit is not None and limit < 1:
             raise ConfigError(f"--limit {limit}: give at least 1")
         area = options.read_crop(truth_area, "--truth-area") or (None, None)
-        found = open_pairs(path, split, bits=bits)
+        found = open_pairs(path, split, bits=files.bits)
         config = EvaluationConfig(
             name=slug(f"{path.resolve().name}-{found.split}"),
             title=f"Solvers over {path.resolve().name}, {found.split}",
             path=str(path.resolve()),
             split=found.split,
             psf=None if psf is None else str(psf.resolve()),
-            background=options.resolved(background),
-            psf_background=options.resolved(psf_background),
-            dead=None if dead is None else str(dead.resolve()),
-            bits=bits,
-            psf_bits=psf_bits,
-            preparation=Preparation(
-                bayer=bayer,
-                demosaicing=demosaic,
-                downsample=downsample,
-                corner=options.read_corner(corner),
-                psf_scale=psf_scale,
-                saturation=saturation,
-                noise_threshold=noise_threshold,
-                psf_channels=psf_channels or found.psf_channels,
-            ),
-            tau=tau,
-            ridge=ridge,
-            coupling=coupling,
-            iterations=iterations,
-            noise=noise,
-            strict=strict,
+            background=options.resolved(files.background),
+            psf_background=options.resolved(files.psf_background),
+            dead=None if files.dead is None else str(files.dead.resolve()),
+            bits=files.bits,
+            psf_bits=files.psf_bits,
+            preparation=files.preparation(psf_channels=psf_channels or found.psf_channels),
+            **vars(solver),
             truth=truth,
             rows=area[0],
             columns=area[1],

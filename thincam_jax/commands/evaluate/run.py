@@ -17,19 +17,11 @@ from thincam_jax.commands.evaluate import page
 from thincam_jax.commands.evaluate.config import EvaluationConfig
 from thincam_jax.commands.evaluate.pair import Scored, key_of, opened, score_pair
 from thincam_jax.commands.report import render_report
-from thincam_jax.commands.run_folder import RunFolder, digest, read_entries, to_json
-from thincam_jax.commands.sweep.workers import (
-    Died,
-    Outcomes,
-    Progress,
-    local_workers,
-    scheduled_workers,
-    tried_twice,
-)
+from thincam_jax.commands.run_folder import RunFolder, to_json
+from thincam_jax.commands.sweep.workers import Died, Outcomes, Progress, tried_twice, workers_of
 from thincam_jax.measured.pairs import Pairs
 from thincam_jax.studies.agreement import MethodSummary, summarised
 
-_SUM = "sha256"
 _COLUMNS = (
     *("number", "name", "method", "psnr_db", "ssim", "residual", "status", "gain", "offset"),
     *("shift", "seconds"),
@@ -60,14 +52,12 @@ class EvaluationFolder(RunFolder):
         held = {"key": found.key, "scores": found.scores, "seconds": found.seconds}
         if found.reason is not None:
             held = {"key": found.key, "reason": found.reason, "traceback": found.traceback}
-        held = json.loads(json.dumps(held))
         (self.path / "pairs" / name).parent.mkdir(exist_ok=True)
-        self.write(f"pairs/{name}.json", to_json({**held, _SUM: digest(to_json(held))}))
+        self.write_entries(f"pairs/{name}.json", json.loads(json.dumps(held)))
 
     def held(self, name: str) -> dict[str, Any]:
         """Entries kept of a pair; none where its file is missing or damaged."""
-        found = read_entries(self.path / "pairs" / f"{name}.json")
-        return found if found.pop(_SUM, None) == digest(to_json(found)) else {}
+        return self.entries(f"pairs/{name}.json") or {}
 
 
 @dataclass(frozen=True)
@@ -130,10 +120,7 @@ def run_evaluation(
     todo = [task for task in tasks if not _is_done(folder, text, task, double)]
     done, failed = len(tasks) - len(todo), 0
     progress(done, failed)
-    count, address = len(tasks), work.scheduler
-    local = address is None
-    workers = local_workers(work.workers, count) if local else scheduled_workers(address)
-    with workers as outcomes:
+    with workers_of(work.scheduler, work.workers, len(tasks)) as outcomes:
         for task, scored in _scored(outcomes, text, todo, double):
             done, failed = done + 1, failed + (scored.reason is not None)
             folder.keep(task.file, scored)

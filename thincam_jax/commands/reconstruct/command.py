@@ -1,7 +1,11 @@
 """The command `thincam reconstruct`."""
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 from typer import Argument, Option
@@ -9,24 +13,13 @@ from typer import Argument, Option
 from thincam_jax.commands.reconstruct import METHODS
 from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, reported, say_result
 
-Psf = Annotated[Path, Option(help="Image of the measured PSF: TIFF, PNG or NPY.")]
-Background = Annotated[
-    str | None,
-    Option(
-        help="Black level: a dark frame, a folder of one each, counts, or corner. Default: found."
-    ),
-]
-PsfBackground = Annotated[
-    str | None, Option(help="Black level of the PSF, if it was exposed differently.")
-]
+if TYPE_CHECKING:
+    from thincam_jax.measured import Preparation
+
 Bits = Annotated[int | None, Option(help="Bit depth of the camera, such as 12 in a file of 16.")]
-PsfBits = Annotated[int | None, Option(help="Bit depth of the PSF, if it differs.")]
-Corner = Annotated[
-    str, Option(help="Dark corner of the PSF: its rows and columns, FIRST:AFTER_LAST.")
-]
-PsfScale = Annotated[
-    float | None,
-    Option(help="Pixel pitch of the PSF over that of the capture; the PSF is enlarged by it."),
+Bayer = Annotated[
+    Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
+    Option(help="Colours of the Bayer mosaic, from its upper left."),
 ]
 PsfChannels = Annotated[
     Literal["each", "mean"], Option(help="each: one PSF for each colour; mean: their mean for all.")
@@ -37,44 +30,116 @@ Crop = Annotated[
         help="Rows and columns of the captures to use, such as 100:740,200:1000; the PSF stays."
     ),
 ]
-Bayer = Annotated[
-    Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
-    Option(help="Colours of the Bayer mosaic, from its upper left."),
-]
 Strict = Annotated[bool, Option("--strict", help="End with exit code 2 at a severe finding.")]
-Dead = Annotated[Path | None, Option(help="Image that marks dead pixels by any value but zero.")]
-Demosaicing = Annotated[
-    Literal["bilinear", "superpixel"],
-    Option(help="bilinear: all pixels; superpixel: joins 2×2 pixels to one, at half the size."),
-]
-Blocks = Annotated[int, Option(help="Average blocks of so many pixels a side.")]
-Saturation = Annotated[
-    float | None, Option(help="Pixels from this part of full scale on count as saturated.")
-]
-Threshold = Annotated[
-    float | None, Option(help="Set the PSF to zero below so many times its noise.")
-]
-Tau = Annotated[
-    float | None,
-    Option(help="Weight of total variation relative to the noise, about 1 to 3. Default: 2."),
-]
-Ridge = Annotated[
-    float | None,
-    Option(help="Weight of the penalty of ridge, relative to the expected one. Default: 1."),
-]
-Coupling = Annotated[
-    Literal["none", "joint", "opponent"] | None,
-    Option(help="How total variation joins colours. Default: joint."),
-]
-Iterations = Annotated[
-    int | None, Option(help="Most iterations. Default: 300; fista 100, pnp 5, ridge 1000.")
-]
-Noise = Annotated[
-    float | None,
-    Option(help="Standard deviation of a raw pixel's noise, counts. Default: estimated."),
-]
 
 
+@dataclass(frozen=True)
+class FileOptions:
+    """Contents of captures and PSFs."""
+
+    background: Annotated[
+        str | None,
+        Option(
+            help="Black level: a dark frame, a folder of one each, counts, or corner. "
+            "Default: found."
+        ),
+    ] = None
+    psf_background: Annotated[
+        str | None, Option(help="Black level of the PSF, if it was exposed differently.")
+    ] = None
+    bits: Bits = None
+    psf_bits: Annotated[int | None, Option(help="Bit depth of the PSF, if it differs.")] = None
+    corner: Annotated[
+        str, Option(help="Dark corner of the PSF: its rows and columns, FIRST:AFTER_LAST.")
+    ] = "5:15"
+    psf_scale: Annotated[
+        float | None,
+        Option(help="Pixel pitch of the PSF over that of the capture; the PSF is enlarged by it."),
+    ] = None
+    bayer: Bayer = None
+    dead: Annotated[
+        Path | None, Option(help="Image that marks dead pixels by any value but zero.")
+    ] = None
+
+    def preparation(self, **more: Any) -> "Preparation":
+        """Settings of `prepare`, and further ones."""
+        from thincam_jax.commands.reconstruct.options import read_corner
+        from thincam_jax.measured import Preparation
+
+        corner = read_corner(self.corner)
+        return Preparation(bayer=self.bayer, corner=corner, psf_scale=self.psf_scale, **more)
+
+
+@dataclass(frozen=True)
+class ImageOptions(FileOptions):
+    """Contents of captures and PSFs, and their preparation for an image."""
+
+    downsample: Annotated[int, Option(help="Average blocks of so many pixels a side.")] = 1
+    demosaic: Annotated[
+        Literal["bilinear", "superpixel"],
+        Option(help="bilinear: all pixels; superpixel: joins 2×2 pixels to one, at half the size."),
+    ] = "bilinear"
+    saturation: Annotated[
+        float | None, Option(help="Pixels from this part of full scale on count as saturated.")
+    ] = None
+    noise_threshold: Annotated[
+        float | None, Option(help="Set the PSF to zero below so many times its noise.")
+    ] = None
+
+    def preparation(self, **more: Any) -> "Preparation":
+        own = {n: getattr(self, n) for n in ("downsample", "saturation", "noise_threshold")}
+        return super().preparation(demosaicing=self.demosaic, **own, **more)
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Settings of a solver, by their names in `Recipe`."""
+
+    tau: Annotated[
+        float | None,
+        Option(help="Weight of total variation relative to the noise, about 1 to 3. Default: 2."),
+    ] = None
+    ridge: Annotated[
+        float | None,
+        Option(help="Weight of the penalty of ridge, relative to the expected one. Default: 1."),
+    ] = None
+    noise: Annotated[
+        float | None,
+        Option(help="Standard deviation of a raw pixel's noise, counts. Default: estimated."),
+    ] = None
+    iterations: Annotated[
+        int | None, Option(help="Most iterations. Default: 300; fista 100, pnp 5, ridge 1000.")
+    ] = None
+    coupling: Annotated[
+        Literal["none", "joint", "opponent"] | None,
+        Option(help="How total variation joins colours. Default: joint."),
+    ] = None
+    strict: Strict = False
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the options of each parameter that is a group of them."""
+    parameters, groups = [], {}
+    for name, parameter in inspect.signature(command).parameters.items():
+        kind = parameter.annotation
+        if isinstance(kind, type) and is_dataclass(kind):
+            groups[name] = kind
+            own = inspect.signature(kind).parameters.values()
+            parameters += [one.replace(kind=parameter.KEYWORD_ONLY) for one in own]
+        else:
+            parameters.append(parameter)
+
+    @functools.wraps(command)
+    def call(**given: Any) -> None:
+        for name, kind in groups.items():
+            given[name] = kind(**{one.name: given.pop(one.name) for one in fields(kind)})
+        command(**given)
+
+    cast(Any, call).__signature__ = inspect.Signature(parameters)
+    return call
+
+
+@grouped
 def reconstruct(
     capture: Annotated[
         list[Path],
@@ -113,19 +178,9 @@ def reconstruct(
         ),
     ] = None,
     set_: Overrides = None,
-    background: Background = None,
-    psf_background: PsfBackground = None,
-    downsample: Blocks = 1,
-    bits: Bits = None,
-    psf_bits: PsfBits = None,
-    corner: Corner = "5:15",
-    psf_scale: PsfScale = None,
+    *,
+    files: ImageOptions,
     crop: Crop = None,
-    bayer: Bayer = None,
-    demosaic: Demosaicing = "bilinear",
-    dead: Dead = None,
-    saturation: Saturation = None,
-    noise_threshold: Threshold = None,
     psf_channels: PsfChannels = "each",
     method: Annotated[
         str,
@@ -133,11 +188,7 @@ def reconstruct(
             help=f"Reconstruction method: {', '.join(METHODS)}.", autocompletion=lambda: METHODS
         ),
     ] = "admm-tv",
-    tau: Tau = None,
-    ridge: Ridge = None,
-    noise: Noise = None,
-    iterations: Iterations = None,
-    coupling: Coupling = None,
+    solver: SolverOptions,
     field: Annotated[
         Literal["sensor", "full"],
         Option(
@@ -153,7 +204,6 @@ def reconstruct(
     white_balance: Annotated[
         str | None, Option(help="White balance of the PNG: grey-world, or gains such as 1.8,1,1.4.")
     ] = None,
-    strict: Strict = False,
 ) -> None:
     """Reconstruct captures with a known PSF.
 
@@ -165,42 +215,21 @@ def reconstruct(
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
         from thincam_jax.commands.reconstruct.run import run_with_bar
-        from thincam_jax.measured import Preparation
 
         known, focusing = options.known_psf(psf or (), camera, set_, network, distance)
         sources = options.Sources(
             known,
-            options.read_background(background),
-            0.0 if camera else options.read_background(psf_background),
-            dead,
-            bits,
-            Preparation(
-                bayer=bayer,
-                demosaicing=demosaic,
-                downsample=downsample,
-                corner=options.read_corner(corner),
-                psf_scale=psf_scale,
-                crop=options.read_crop(crop),
-                saturation=saturation,
-                noise_threshold=noise_threshold,
-                psf_channels=psf_channels,
-            ),
-            psf_bits,
+            options.read_background(files.background),
+            0.0 if camera else options.read_background(files.psf_background),
+            files.dead,
+            files.bits,
+            files.preparation(crop=options.read_crop(crop), psf_channels=psf_channels),
+            files.psf_bits,
             options.read_distances(distances, psf or ()),
             options.read_exposures(exposure or (), len(psf or ()), len(capture)),
         )
-        recipe = options.Recipe(
-            method=method.replace("-", "_"),
-            tau=tau,
-            iterations=iterations,
-            coupling=coupling,
-            field=field,
-            flip=flip,
-            ridge=ridge,
-            noise=noise,
-            focusing=focusing,
-            strict=strict,
-        )
+        name, settings = method.replace("-", "_"), vars(solver)
+        recipe = options.Recipe(name, field=field, flip=flip, focusing=focusing, **settings)
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
         output = options.Output(out, linear, gamma, balance, unsure)
         jobs = plan_jobs(capture[0], sources, output, tuple(capture[1:]))
@@ -209,22 +238,17 @@ def reconstruct(
         raise typer.Exit(end)
 
 
+@grouped
 def check(
-    psf: Psf,
+    psf: Annotated[Path, Option(help="Image of the measured PSF: TIFF, PNG or NPY.")],
     capture: Annotated[Path, Option(help="Capture of the PSF's size.")],
-    background: Background = None,
-    psf_background: PsfBackground = None,
+    *,
+    files: FileOptions,
     downsample: Annotated[
         int | None,
         Option(help="Average blocks of so many pixels a side. Default: 160 pixels remain, or 320."),
     ] = None,
-    bits: Bits = None,
-    psf_bits: PsfBits = None,
-    corner: Corner = "5:15",
-    psf_scale: PsfScale = None,
     crop: Crop = None,
-    bayer: Bayer = None,
-    dead: Dead = None,
     psf_channels: PsfChannels = "each",
     search: Annotated[
         float, Option(help="Range of scales to search, as a fraction: 0.06 is ±6 %.")
@@ -243,23 +267,19 @@ def check(
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.run import check_files, enough_blocks
         from thincam_jax.commands.terminal import progress_bar
-        from thincam_jax.measured import Preparation
 
         sources = options.Sources(
             psf,
-            options.read_background(background),
-            options.read_background(psf_background),
-            dead,
-            bits,
-            Preparation(
-                bayer=bayer,
+            options.read_background(files.background),
+            options.read_background(files.psf_background),
+            files.dead,
+            files.bits,
+            files.preparation(
                 downsample=1 if downsample is None else downsample,
-                corner=options.read_corner(corner),
-                psf_scale=psf_scale,
                 crop=options.read_crop(crop),
                 psf_channels=psf_channels,
             ),
-            psf_bits,
+            files.psf_bits,
         )
         sources = enough_blocks(sources, capture) if downsample is None else sources
         with progress_bar() as bar:

@@ -13,13 +13,7 @@ from pyarrow import csv
 from thincam_jax._core.files import write_whole
 from thincam_jax.commands.run_folder import RunFolder, read_entries
 from thincam_jax.commands.sweep.point import GridPoint, Metrics, described, measure_point, one_line
-from thincam_jax.commands.sweep.workers import (
-    Died,
-    Progress,
-    local_workers,
-    scheduled_workers,
-    tried_twice,
-)
+from thincam_jax.commands.sweep.workers import Died, Progress, tried_twice, workers_of
 
 _PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
 _MEASURE = "mean_psnr_db/"  # of each method, over all targets
@@ -178,24 +172,18 @@ def run_sweep(
             if point.config is None:
                 keep(point, Metrics(None, point.reason))
         if runnable:
-            local = scheduler is None
-            work = local_workers(workers, len(runnable)) if local else scheduled_workers(scheduler)
-            with work as outcomes:
+            with workers_of(scheduler, workers, len(runnable)) as outcomes:
                 for key, result in tried_twice(outcomes, measure, runnable):
-                    keep(todo[key], _outcome(result))
+                    if not isinstance(result, Metrics):  # a worker died, or lacks the package
+                        died = isinstance(result, Died)
+                        result = Metrics(None, "worker died" if died else one_line(result))
+                    keep(todo[key], result)
     finally:
         table, failures = folder.collect(points)
     if table is None:
         return Swept(len(points), 0, failures)
     best = summarise(folder.path, table, list(points[0].values))
     return Swept(len(points), table.num_rows, failures, best)
-
-
-def _outcome(result: Any) -> Metrics:
-    """A worker that dies and a worker without the package have their reasons too."""
-    if isinstance(result, Metrics):
-        return result
-    return Metrics(None, "worker died" if isinstance(result, Died) else one_line(result))
 
 
 def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, ...]:

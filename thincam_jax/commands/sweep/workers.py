@@ -53,6 +53,13 @@ def tried_twice(
         yield from outcomes(measure, {name: tasks[name]})
 
 
+def workers_of(
+    scheduler: str | None, workers: int | None, tasks: int
+) -> contextlib.AbstractContextManager[Outcomes]:
+    """Workers of a scheduler's address, or so many new processes."""
+    return local_workers(workers, tasks) if scheduler is None else scheduled_workers(scheduler)
+
+
 @contextlib.contextmanager
 def local_workers(workers: int | None, tasks: int) -> Iterator[Outcomes]:
     """New processes, by default one for each core and never more than tasks; killed at the end.

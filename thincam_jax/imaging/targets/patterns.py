@@ -37,7 +37,8 @@ def slanted_edge(
     a, b = max(abs(cosine), _THIN), max(abs(sine), _THIN)
     reach = (a + b) / 2  # a pixel farther from the edge than that is all on one side
     distance = x * cosine + y * sine
-    covered = _pixel_mean(_ramp_integral, np.clip(distance, -reach, reach), a, b)
+    near = np.clip(distance, -reach, reach)
+    covered = _pixel_mean(lambda t: np.maximum(t, 0.0) ** 2 / 2, near, a, b)
     covered = np.where(np.abs(distance) < reach, covered, distance > 0)
     return low + (high - low) * covered
 
@@ -108,11 +109,6 @@ def _pixel_mean(second_integral, position, a, b):
     outer = second_integral(position + wide) + second_integral(position - wide)
     inner = second_integral(position + narrow) + second_integral(position - narrow)
     return (outer - inner) / (a * b)
-
-
-def _ramp_integral(t):
-    """Second integral of the unit step at 0."""
-    return np.maximum(t, 0.0) ** 2 / 2
 
 
 def _square_wave_integral(t):

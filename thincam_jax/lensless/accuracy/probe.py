@@ -11,24 +11,148 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
-from thincam_jax._core.grids import Grid, block_mean
-from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast, squared_modulus
-from thincam_jax.lensless.accuracy.lines import (
+from thincam_jax._core.grids import (
+    Grid,
     SparseGrid,
-    angular_spectrum_terms,
-    chosen,
-    fine_fields,
+    block_mean,
+    centred_frequencies,
+    centred_indices,
+)
+from thincam_jax._core.precision import (
+    PRECISIONS,
+    Precision,
+    allow,
+    as_complex,
+    cast,
+    squared_modulus,
+    turn_phasor,
 )
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
-from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
+from thincam_jax.lensless.propagation.angular_spectrum import (
+    lit_mask,
+    padded_shape,
+    planes,
+    propagate,
+    spherical_wave,
+)
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
 from thincam_jax.lensless.psf import closed_terms
+
+# Rows and columns that are looked at. All sizes have this many, so that nothing recompiles.
+COUNT = 256
+# Share of them that may lie at the shadow's two edges, where the fields change fastest.
+_AT_EDGES = 0.5
+
+
+def chosen(
+    count: int, edges: tuple[float, float], zone: float, seed: int
+) -> tuple[Int[np.ndarray, " chosen"], Float[np.ndarray, " chosen"]]:
+    """Indices out of `count`, and how many of them each stands for.
+
+    Everything if it is few enough; else a stratified random choice that is denser within `zone`
+    (in samples) of the `edges` (indices, which may lie outside). Filled up with weight zero.
+    """
+    if count <= COUNT:
+        filled = np.zeros(COUNT, int)
+        filled[:count] = np.arange(count)
+        return filled, (np.arange(COUNT) < count).astype(float)
+    indices = np.arange(count)
+    distance = np.min([np.abs(indices - edge) for edge in edges], axis=0)
+    near = distance <= max(zone, 4.0)
+    density = np.full(count, COUNT * (1 - _AT_EDGES) / count)
+    if near.any():
+        density[near] = np.minimum(1.0, density[near] + COUNT * _AT_EDGES / near.sum())
+    density *= COUNT / density.sum()
+    density = np.minimum(density, 1.0)
+    # One of each stratum of equal total density.
+    total = np.cumsum(density)
+    offsets = np.random.default_rng(seed).uniform(size=COUNT)
+    strata = (np.arange(COUNT) + offsets) * total[-1] / COUNT
+    found = np.minimum(np.searchsorted(total, strata), count - 1)
+    return found, total[-1] / (COUNT * density[found])
+
+
+@jax.jit(static_argnames=("shape", "method"))
+def angular_spectrum_terms(
+    mask: AbstractFactoredMask,
+    points: SparseGrid,
+    path: LightPath,
+    shape: tuple[int, int],
+    method: PsfMethod,
+) -> SeparableSum:
+    """The PSF of `angular_spectrum` at some rows and columns of a grid of `shape`, as a product.
+
+    In the Fresnel approximation the field of a separable mask stays separable, so that a sampled
+    propagation is, but for the cross term of the exact phase, one along each axis: the same
+    samples, window, band limit and rounding.
+    """
+    terms = mask.terms(path.wavelength)
+    lower, upper, weights = pairs(terms.coefficients)
+    plane, sensor = planes(Grid(shape, points.pitch), method)
+    half = method.samples // 2 if method.pixel_integration else 0
+    factors = []
+    both = (terms.rows, points.row_indices), (terms.columns, points.column_indices)
+    for axis, (along, indices) in enumerate(both):
+        samples, line = plane.shape[axis], Grid((1, plane.shape[axis]), plane.pitch)
+        values = along.samples(line.x - mask.centre[axis], line.pitch)
+        lit = values * spherical_wave(line, path)
+        # Sensor samples of the chosen pixels, counted from the axis.
+        fine = indices[:, None] * method.samples + jnp.arange(-half, half + 1, dtype=indices.dtype)
+        across = sensor.shape[axis]
+        size = padded_shape((samples, samples), (across, across), 2.0)[0]
+        fields = _by_transform(lit, plane.pitch, path, size, fine.ravel())
+        fields = fields.reshape(-1, *fine.shape)
+        fields = fields * as_complex(jnp.sqrt(path.magnification))
+        factors.append(jnp.mean(fields[lower, :] * jnp.conj(fields[upper, :]), axis=-1))
+    return SeparableSum(weights[:, None] * factors[0], factors[1], points)
+
+
+def _by_transform(lit, pitch, path: LightPath, size: int, fine) -> Complex[Array, "order n"]:
+    """Propagated on a window of `size` samples, taken where `fine` samples lie."""
+    count = lit.shape[-1]
+    padded = jnp.pad(lit, ((0, 0), (0, size - count)))
+    window = jax.vmap(lambda line: propagate(line[None], pitch, path)[0])(padded)
+    position = jnp.round(fine + (count - 1) / 2).astype(jnp.int32) % size
+    return window[:, position]
+
+
+@functools.partial(jax.jit, static_argnames=("samples", "axis"))
+def fine_fields(
+    mask: AbstractFactoredMask,
+    path: LightPath,
+    reach: Float[Array, ""],
+    exact: Bool[Array, ""],
+    samples: int,
+    axis: int = 1,
+) -> Complex[Array, "order n"]:
+    r"""Fields of the terms on a line along x (or y, axis 0), finely sampled, over ±`reach`.
+
+    `exact` takes the exact phases of the spherical wave and of the propagation, which Fresnel's
+    approximation replaces by :math:`\pi\xi^2/(\lambda t)` and :math:`-\pi\lambda d u^2`; the
+    difference of the two is what the approximation costs, while the sampling is common to both.
+    """
+    terms = mask.terms(path.wavelength)
+    factors = terms.columns if axis else terms.rows
+    pitch = 4 * reach / samples  # as much again on both sides, so that nothing wraps round
+    x = centred_indices(samples, pitch.dtype) * pitch
+    values = factors.samples(x, pitch)
+    parabolic = turn_phasor(x**2 / (2 * path.wavelength * path.object_distance))
+    wave = jnp.where(exact, spherical_wave(Grid((1, samples), pitch), path)[0], parabolic)
+    u = jnp.fft.ifftshift(centred_frequencies(samples, pitch))
+    s = (path.wavelength * u) ** 2
+    carried = s < 1
+    bent = 1 + jnp.where(exact, jnp.sqrt(jnp.where(carried, 1 - s, 1.0)), 1.0)
+    turns = -(path.distance / path.wavelength) * jnp.where(carried, s, 0.0) / bent
+    transfer = jnp.where(carried, turn_phasor(turns), 0.0)
+    fields = jnp.fft.ifft(jnp.fft.fft(values * wave, axis=-1) * transfer, axis=-1)
+    return fields[:, samples // 4 : samples - samples // 4]
+
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
 _FINE_SAMPLES = 2**16
@@ -43,17 +167,8 @@ _PRODUCT_ROUNDING: dict[Precision, float] = {"float32": 2e-7, "float64": 5e-16}
 _EPSILON: dict[Precision, float] = {"float32": 2.0**-24, "float64": 2.0**-53}
 
 
-@dataclass(frozen=True, eq=False)
-class Lines:
-    """The rows and columns that are looked at, as centred indices, and what each stands for."""
-
-    rows: Float[np.ndarray, " row"]
-    columns: Float[np.ndarray, " column"]
-    row_weights: Float[np.ndarray, " row"]
-    column_weights: Float[np.ndarray, " column"]
-
-    def points(self, pitch: Float[Array, ""]) -> SparseGrid:
-        return SparseGrid(self.rows, self.columns, pitch)
+# Along y and along x: indices, and what each stands for.
+Both = tuple[Float[np.ndarray, " row"], Float[np.ndarray, " column"]]
 
 
 @dataclass(frozen=True)
@@ -73,8 +188,8 @@ class Numbers:
     largest_phase: float
 
 
-def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
-    """Rows and columns of the grid, denser at the edges of the shadow."""
+def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> tuple[Both, Both]:
+    """Centred indices of rows and columns of the grid, denser at the shadow's edges; weights."""
     pitch, scale = float(grid.pitch), float(path.magnification)
     # Of the whole grid the sum would be compiled for each of its shapes.
     top, left = (np.array([(1 - count) / 2]) for count in grid.shape)
@@ -87,7 +202,7 @@ def lines_of(mask: AbstractFactoredMask, grid: Grid, path: LightPath) -> Lines:
         indices, weights = chosen(count, (middle - half, middle + half), zone, seed=axis)
         found.append((indices - (count - 1) / 2, weights))
     (rows, row_weights), (columns, column_weights) = found
-    return Lines(rows, columns, row_weights, column_weights)
+    return (rows, columns), (row_weights, column_weights)
 
 
 @jax.jit(static_argnames=("shape", "method"))
@@ -136,31 +251,15 @@ class Factors:
 
 
 def factors(
-    terms: SeparableSum,
-    row_weights: Float[np.ndarray, " row"],
-    column_weights: Float[np.ndarray, " column"],
+    rows: Complex[ArrayLike, "term row"], columns: Complex[ArrayLike, "term column"], weights: Both
 ) -> Factors:
-    """The factors of a separable sum whose samples stand for `weights` samples each."""
-    return weighted(
-        np.asarray(terms.rows, complex),
-        np.asarray(terms.columns, complex),
-        row_weights,
-        column_weights,
-    )
-
-
-def weighted(
-    rows: Complex[np.ndarray, "term row"],
-    columns: Complex[np.ndarray, "term column"],
-    row_weights: Float[np.ndarray, " row"],
-    column_weights: Float[np.ndarray, " column"],
-) -> Factors:
-    """Real factors, scaled by the roots of the weights, of Σ Re{Y X}."""
-    rows, columns = rows * np.sqrt(row_weights), columns * np.sqrt(column_weights)
+    """Factors of Σ Re{Y X} whose samples stand for `weights` samples each."""
+    both = zip((rows, columns), weights, strict=True)
+    down, across = (np.asarray(factor, complex) * np.sqrt(weight) for factor, weight in both)
     # Re{YX} = Re Y Re X − Im Y Im X.
     return Factors(
-        np.concatenate([np.real(rows), -np.imag(rows)]),
-        np.concatenate([np.real(columns), np.imag(columns)]),
+        np.concatenate([np.real(down), -np.imag(down)]),
+        np.concatenate([np.real(across), np.imag(across)]),
     )
 
 
@@ -201,13 +300,14 @@ class MaskProbe:
         self, mask: AbstractFactoredMask, grid: Grid, path: LightPath, *, pixel_integration: bool
     ) -> None:
         self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
-        self.lines = lines_of(mask, grid, path)
+        self.lines, self.weights = lines_of(mask, grid, path)
         # Those of few fringes differ by rounding, and each count is compiled; points take none.
         counted = pixel_nodes(mask, grid, path, "float64") if pixel_integration else 0
         self.nodes = max(PIXEL_NODES, counted)
-        self.given: dict[Precision, tuple[AbstractFactoredMask, Array, LightPath]]
+        self.given: dict[Precision, tuple[AbstractFactoredMask, SparseGrid, LightPath]]
         with allow("float64", mask, grid, path):
-            self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
+            points = SparseGrid(*self.lines, jnp.asarray(grid.pitch))
+            self.given = {p: cast((mask, points, path), p) for p in PRECISIONS}
         self._cache: dict[tuple[Model, Precision, int | None], Factors] = {}
 
     @functools.cached_property
@@ -221,12 +321,10 @@ class MaskProbe:
         nodes = (nodes or self.nodes) if model == "separable" else None
         key = model, precision, nodes
         if key not in self._cache:
+            method = PsfMethod(model, precision, self.pixel_integration, nodes=nodes)
             with allow(precision):
-                mask, pitch, path = self.given[precision]
-                points = self.lines.points(pitch)
-                method = PsfMethod(model, precision, self.pixel_integration, nodes=nodes)
-                terms = closed_terms(mask, points, path, method)
-                self._cache[key] = self._factors(terms)
+                terms = closed_terms(*self.given[precision], method)
+                self._cache[key] = factors(terms.rows, terms.columns, self.weights)
         return self._cache[key]
 
     @property
@@ -242,15 +340,12 @@ class MaskProbe:
         if not self.pixel_integration:
             return PIXEL_NODES
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
+            mask, points, path = self.given["float64"]
             # The irradiance's band ends at width/(λd).
             width = max(float(extent) for extent in mask.extent)
-            fringes = float(pitch) * width / float(path.wavelength * path.distance)
+            fringes = float(points.pitch) * width / float(path.wavelength * path.distance)
         enough = [n for n in _NODES if n >= fringes * math.pi / 2 + 10]
         return enough[0] if enough else _NODES[-1]
-
-    def _factors(self, terms: SeparableSum) -> Factors:
-        return factors(terms, self.lines.row_weights, self.lines.column_weights)
 
     def model_error(self, model: Model, nodes: int | None = None) -> float:
         """Relative distance of a closed form from the reference, without rounding."""
@@ -278,23 +373,22 @@ class MaskProbe:
     def angular_spectrum(self, method: PsfMethod) -> float:
         """Relative distance of the angular spectrum from the reference, rounding included."""
         with allow(method.float_type):
-            mask, pitch, path = self.given[method.float_type]
-            points = self.lines.points(pitch)
-            found = self._factors(angular_spectrum_terms(mask, points, path, self.shape, method))
+            terms = angular_spectrum_terms(*self.given[method.float_type], self.shape, method)
+            found = factors(terms.rows, terms.columns, self.weights)
         return distance(found, self.reference) / self.scale
 
     def rayleigh_sommerfeld(self, method: PsfMethod) -> float:
         """Relative error of the direct sum, from a few pixels: no line shows where it aliases."""
-        few = [spread(count, _FEW) for count in self.shape]
+        rows, columns = (spread(count, _FEW) for count in self.shape)
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
-            points = SparseGrid(few[0], few[1], pitch)
+            mask, points, path = self.given["float64"]
+            points = SparseGrid(rows, columns, points.pitch)
             averaged = self.pixel_integration
             separable = PsfMethod("separable", "float64", averaged, nodes=self.nodes)
             exact = np.asarray(closed_terms(mask, points, path, separable).image())
         with allow(method.float_type):
-            mask, pitch, path = self.given[method.float_type]
-            points = SparseGrid(few[0], few[1], pitch)
+            mask, points, path = self.given[method.float_type]
+            points = SparseGrid(rows, columns, points.pitch)
             found = np.asarray(_direct_sum(mask, points, path, self.shape, method), float)
         share = exact.size / math.prod(self.shape)
         return float(np.linalg.norm(found - exact)) / math.sqrt(share) / self.scale
@@ -302,13 +396,13 @@ class MaskProbe:
     def numbers(self) -> "Numbers":
         """Sizes of the effects that the reasons name."""
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
+            mask, points, path = self.given["float64"]
             zones = getattr(mask, "zone_orders", None)
             epsilon, phase, radius = 0.0, 0.0, max(float(extent) for extent in mask.extent) / 2
             if zones is not None:
                 order, beta = max(abs(k) for k in zones().orders), zones().beta
                 epsilon, phase = order * float(path.epsilon(beta)), order * float(beta) * radius**2
-            reach = max(self.shape) * float(pitch) / 2 / float(path.magnification) + radius
+            reach = max(self.shape) * float(points.pitch) / 2 / float(path.magnification) + radius
             return Numbers(
                 epsilon=epsilon,
                 first_order=epsilon * phase,
@@ -332,9 +426,9 @@ class MaskProbe:
         The cross term of the two axes is left out: an estimate, not a bound.
         """
         with allow("float64"):
-            mask, pitch, path = self.given["float64"]
-            half_sensor, which = max(self.shape) * pitch / 2, map(jnp.asarray, (True, False))
-            found = [_fine_lines(mask, half_sensor, path, exact) for exact in which]
+            mask, points, path = self.given["float64"]
+            pitch, which = points.pitch, map(jnp.asarray, (True, False))
+            found = [_fine_lines(mask, max(self.shape) * pitch / 2, path, one) for one in which]
         exact, fresnel = (
             self._line_factors((fields[0], fields[-1]), float(reach), float(pitch), weighted_pairs)
             for fields, reach, weighted_pairs in jax.device_get(found)
@@ -350,11 +444,8 @@ class MaskProbe:
         half = round(pitch / step / 2) if self.pixel_integration else 0
         inside = np.unique(np.linspace(-half, half, _IN_PIXEL).round()).astype(int)
         picked = []
-        for field, indices in zip(fields, (self.lines.rows, self.lines.columns), strict=True):
+        for field, indices in zip(fields, self.lines, strict=True):
             position = np.round(indices * pitch / step + (count - 1) / 2).astype(int)
             found = field[:, np.clip(position[:, None] + inside, 0, count - 1)]
             picked.append(np.mean(found[lower] * found[upper].conj(), axis=-1))
-        lines = self.lines
-        return weighted(
-            weights[:, None] * picked[0], picked[1], lines.row_weights, lines.column_weights
-        )
+        return factors(weights[:, None] * picked[0], picked[1], self.weights)

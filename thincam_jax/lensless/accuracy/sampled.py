@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, SparseGrid
 from thincam_jax._core.precision import (
     PRECISIONS,
     RESULT_ROUNDING,
@@ -35,7 +35,6 @@ from thincam_jax._core.precision import (
     precision_of,
     squared_modulus,
 )
-from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.accuracy.probe import spread
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask

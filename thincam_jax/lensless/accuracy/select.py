@@ -1,8 +1,9 @@
 """The cheapest model that meets a tolerance, with its error predicted and the reasons in words."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import chain, islice, takewhile
 
 import jax
 
@@ -15,7 +16,7 @@ from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, precision_o
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, has_few_terms
+from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms
 from thincam_jax.lensless.method import (
     SAMPLED,
     Model,
@@ -112,31 +113,48 @@ def choose_model(
 
     **See also**: `predict_error`, `plan_capture`, `psf`.
     """
-    tolerance = tolerance_of(tolerance)
-    if isinstance(camera, LenslessCamera) and not has_few_terms(camera.mask):
-        grid = camera.sensor.grid
-        path = camera.path(wavelength, object_distance)
-        _require_known((camera, path, grid))
-        found = sampled_errors(camera.mask, grid, path, pixel_integration)
-        return _select_sampled(camera.mask, grid, found, tolerance)
-    probe = probe_of(camera, wavelength, object_distance, pixel_integration)
-    grid = camera.sensor.grid
-    considered: list[Prediction] = []
-    for method, cost in candidates(camera.mask, grid, pixel_integration):
-        error = predicted_error(probe, camera.mask, grid, method)
-        considered.append(Prediction(method, error, cost))
-        if error <= tolerance:
-            break
-    best = min(considered, key=lambda p: p.predicted_error)
-    chosen = considered[-1] if considered[-1].predicted_error <= tolerance else best
-    paraxial_error = probe.paraxial_error()
+    tolerance = checks.relative_tolerance(tolerance)
+    mask, grid = camera.mask, camera.sensor.grid
+    if has_few_terms(mask):
+        probe = probe_of(camera, wavelength, object_distance, pixel_integration)
+        ways = candidates(mask, grid, pixel_integration)
+        found = ((method, predicted_error(probe, mask, grid, method)) for method in ways)
+    else:
+        probe, path = None, camera.path(wavelength, object_distance)
+        _require_known((camera, path))
+        finer = sampled_errors(mask, grid, path, pixel_integration)
+        found = chain(islice(finer, 1), takewhile(lambda way: _fits(mask, grid, way[0]), finer))
+    considered = [
+        Prediction(method, error, psf_cost(mask, grid, method))
+        for method, error in until_met(found, tolerance)
+    ]
+    chosen = min(considered, key=lambda one: one.predicted_error)
+    if considered[-1].predicted_error <= tolerance:
+        chosen = considered[-1]
+    if probe is None:
+        paraxial_error, reasons = _sampled_reasons(mask, chosen)
+    else:
+        paraxial_error = probe.paraxial_error()
+        reasons = _reasons(probe, chosen, paraxial_error)
     return Selection(
         **vars(chosen),
         meets_tolerance=chosen.predicted_error <= tolerance,
         paraxial_error=paraxial_error,
-        reasons=_reasons(probe, chosen, paraxial_error),
+        reasons=reasons,
         considered=tuple(considered),
     )
+
+
+def until_met(
+    found: Iterable[tuple[PsfMethod, float]], tolerance: float
+) -> list[tuple[PsfMethod, float]]:
+    """Methods with their errors, the cheapest first, up to the first within the tolerance."""
+    considered = []
+    for method, error in found:
+        considered.append((method, error))
+        if error <= tolerance:
+            break
+    return considered
 
 
 @checked
@@ -208,47 +226,25 @@ def predict_cost(
     return psf_cost(camera.mask, grid, psf_method(camera.mask, grid, **how)), None
 
 
-def _select_sampled(
-    mask: AbstractMask, grid: Grid, found: Iterator[tuple[PsfMethod, float]], tolerance: float
-) -> Selection:
-    """Among ever more samples of `angular_spectrum`, the fewest that are enough and fit."""
-    free, considered = available_bytes(), []
-    for method, error in found:
-        cost = psf_cost(mask, grid, method)
-        if considered and free is not None and cost.bytes > free:
-            break
-        considered.append(Prediction(method, error, cost))
-        if error <= tolerance:
-            break
-    chosen, method = considered[-1], considered[-1].method
-    many = mask.exact_model is not None
-    left = f"{chosen.predicted_error:.1e}"
-    reasons = (
-        _many_terms(mask, chosen)
-        if many
-        else (
+def _fits(mask: AbstractMask, grid: Grid, method: PsfMethod) -> bool:
+    """Whether a PSF fits into the memory that is free."""
+    free = available_bytes()
+    return free is None or psf_cost(mask, grid, method).bytes <= free
+
+
+def _sampled_reasons(mask: AbstractMask, chosen: Prediction) -> tuple[float, tuple[str, ...]]:
+    """The paraxial error and the reasons for a mask without a short sum of terms."""
+    method, left = chosen.method, f"{chosen.predicted_error:.1e}"
+    if mask.exact_model is None:
+        return 0.0, (
             f"a {type(mask).__name__} has no exact PSF: of 'angular_spectrum' with "
             f"{method.samples}×{method.samples} samples a pixel, the mask's middle with more "
             f"of them differs so that {left} is left; far behind a small mask "
             "most of that is cut off by the window, and a larger mask_shape of psf cuts less",
             "errors are counted from scalar diffraction without Fresnel's approximation",
         )
-    )
-    return Selection(
-        **vars(chosen),
-        meets_tolerance=chosen.predicted_error <= tolerance,
-        paraxial_error=math.nan if many else 0.0,
-        reasons=reasons,
-        considered=tuple(considered),
-    )
-
-
-def _many_terms(mask: AbstractMask, chosen: Prediction) -> tuple[str, ...]:
-    """The reasons for a mask of many terms or of rings."""
-    averaged = ""
-    if points := chosen.method.nodes:
-        averaged = f", a pixel's average by {points} points: {chosen.predicted_error:.1e}"
-    return (
+    averaged = f", a pixel's average by {method.nodes} points: {left}" if method.nodes else ""
+    return math.nan, (
         f"{mask.exact_model!r} adds up the field of the mask's {parts_of(mask)}{averaged}",
         "errors are counted from the exact Fresnel field",
     )
@@ -261,26 +257,6 @@ def _require_known(numbers) -> None:
         )
 
 
-def tolerance_of(tolerance: float) -> float:
-    """A relative error, at most 1."""
-    tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
-    if tolerance > 1:
-        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
-    return tolerance
-
-
-def require_camera(camera: LenslessCamera, function: str) -> AbstractFactoredMask:
-    """The mask of a camera, if it has few terms: its fields then have one-dimensional factors."""
-    mask = camera.mask
-    if not has_few_terms(mask):
-        raise TypeError(
-            f"{function} needs a mask of few separable terms, such as FresnelZoneAperture; "
-            f"for this {type(mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "
-            "and their oversampling yourself"
-        )
-    return mask
-
-
 def probe_of(
     camera: LenslessCamera,
     wavelength: Number,
@@ -289,36 +265,36 @@ def probe_of(
     at: Position | None = None,
 ) -> MaskProbe:
     """The probe of a camera whose numbers are known, off both axes with products of both."""
-    mask = require_camera(camera, "choose_model")
+    mask = camera.mask
+    if not has_few_terms(mask):
+        raise TypeError(
+            "choose_model needs a mask of few separable terms, such as FresnelZoneAperture; "
+            f"for this {type(mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "
+            "and their oversampling yourself"
+        )
     path = replace(camera.path(wavelength, object_distance, at), skew=False)
     grid = camera.sensor.grid
     _require_known((camera, path, grid))
     return MaskProbe(mask, grid, path, pixel_integration=pixel_integration)
 
 
-def candidates(
-    mask: AbstractMask, grid: Grid, pixel_integration: bool
-) -> list[tuple[PsfMethod, Cost]]:
+def candidates(mask: AbstractMask, grid: Grid, pixel_integration: bool) -> list[PsfMethod]:
     """Candidates that fit into memory, cheapest first, up to the reference."""
-    free = available_bytes()
     own = precision_of(grid.pitch)
-    methods = [
-        psf_method(mask, grid, PsfMethod(model, precision), pixel_integration)
-        for model in models_of(mask)
-        for precision in PRECISIONS
-    ]
-    costs = {method: psf_cost(mask, grid, method) for method in methods}
 
     def time(method: PsfMethod) -> float:
         # An operation in double precision takes about two in single.
-        operations = costs[method].flops * (2.0 if method.precision == "float64" else 1.0)
+        operations = psf_cost(mask, grid, method).flops * (1 + (method.precision == "float64"))
         return operations + (0.0 if method.precision == own else _CONVERSION)
 
-    fitting = sorted((m for m in methods if free is None or costs[m].bytes <= free), key=time)
+    methods = (
+        psf_method(mask, grid, PsfMethod(model, precision), pixel_integration)
+        for model in models_of(mask)
+        for precision in PRECISIONS
+    )
+    fitting = sorted((m for m in methods if _fits(mask, grid, m)), key=time)
     reference = PsfMethod("separable", "float64", pixel_integration)
-    if reference in fitting:
-        fitting = fitting[: fitting.index(reference) + 1]
-    return [(method, costs[method]) for method in fitting]
+    return fitting[: fitting.index(reference) + 1] if reference in fitting else fitting
 
 
 def predicted_error(probe: MaskProbe, mask: AbstractMask, grid: Grid, method: PsfMethod) -> float:

@@ -242,16 +242,6 @@ def other_models(mask: AbstractMask) -> str:
     return f"{exact}'angular_spectrum' or 'rayleigh_sommerfeld'"
 
 
-def require_factored(mask: AbstractMask, model: str) -> AbstractFactoredMask:
-    """The mask, or one line that says which models can be used without terms."""
-    if not isinstance(mask, AbstractFactoredMask):
-        raise TypeError(
-            f"model {model!r} needs a mask of few separable terms, such as FresnelZoneAperture; "
-            f"for a {type(mask).__name__} use {other_models(mask)}"
-        )
-    return mask
-
-
 class ZoneOrders(Module):
     """The unbounded zone plate Σ_k c_k e^{jkβr²}, and the width of the aperture that bounds it.
 

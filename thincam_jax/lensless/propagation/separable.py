@@ -20,7 +20,6 @@ from thincam_jax.lensless.masks.base import (
     AxisFactors,
     MaskTerms,
     pairs,
-    require_factored,
 )
 from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
@@ -174,7 +173,7 @@ def cell_shadows(
 
 
 def separable(
-    mask: AbstractMask,
+    mask: AbstractFactoredMask,
     grid: Grid,
     path: LightPath,
     *,
@@ -196,8 +195,7 @@ def separable(
     `pixel_integration` averages each axis over the pixel by Gauss-Legendre quadrature with `nodes`
     nodes: the average of a separable term is separable.
     """
-    factored = require_factored(mask, "separable")
-    terms = factored.terms(path.wavelength)
+    terms = mask.terms(path.wavelength)
     down, across = terms.rows, terms.columns
     lower, upper, weights = pairs(terms.coefficients)
     scale = path.magnification
