@@ -135,27 +135,25 @@ class WienerSynthesis(eqx.Module):
         self.weights = tuple(map(tuple, matrix.tolist()))
         self.object_pitch = cameras.pitch
 
-    def __call__(
-        self, captures: Float[Array, "capture *batch y x"], noise_variance: Numbers
-    ) -> Reconstruction:
+    def __call__(self, captures: Numbers, noise_variance: Numbers) -> Reconstruction:
         """The reconstruction of captures (capture, *batch, y, x).
 
         `noise_variance`: that of a pixel, > 0, one number, one for each capture or (capture,
         *batch).
         """
-        captures = jnp.asarray(captures, dtype=self.uniform.dtype)
-        require_captures(captures, (len(self.uniform), *self.sensor_shape))
-        count, *batch, rows, columns = captures.shape
+        known = checks.at_hand(captures, self.uniform.dtype)
+        require_captures(known.shape, (len(self.uniform), *self.sensor_shape))
+        count, *batch, rows, columns = known.shape
         variance = checks.positive_all("noise_variance", jnp.asarray(noise_variance), "units²")
         if variance.shape != (count, *batch)[: variance.ndim]:
             raise ValueError(
                 f"noise_variance has shape {variance.shape}; give one number, {count} (one for "
                 f"each capture) or {(count, *batch)}"
             )
-        variance = variance.astype(captures.dtype)
+        variance = variance.astype(known.dtype)
         variance = variance.reshape(variance.shape + (1,) * (1 + len(batch) - variance.ndim))
         variance = jnp.broadcast_to(variance, (count, *batch)).reshape(count, -1)
-        image = each_image(self._image, captures.reshape(count, -1, rows, columns), variance)
+        image = each_image(self._image, known.reshape(count, -1, rows, columns), variance)
         return Reconstruction(image.reshape(*batch, *self.field_shape), self.object_pitch, "wiener")
 
     @eqx.filter_jit
@@ -256,20 +254,18 @@ def require_cameras(recording: Recording, method: str) -> Cameras:
     return recording.imaging_model
 
 
-def each_image(
-    filtered: Callable[..., Array], captures: Float[Array, "capture image y x"], *more: Array
-) -> Float[Array, "image m n"]:
-    """A filter's images of captures, and of `more` numbers (capture, image) of each, in turn."""
-    parts = (checks.each(part, axis=1) for part in (captures, *more))
+def each_image(filtered: Callable[..., Array], *numbers: Numbers) -> Float[Array, "image m n"]:
+    """A filter's images, one after the other, of `numbers` (capture, image, …)."""
+    parts = (checks.each(part, axis=1) for part in numbers)
     return checks.stacked([filtered(*part) for part in zip(*parts, strict=True)])
 
 
-def require_captures(captures: Array, wanted: tuple[int, int, int]) -> None:
+def require_captures(shape: tuple[int, ...], wanted: tuple[int, int, int]) -> None:
     """Require (capture, …, y, x) of the filter's numbers."""
-    if (captures.shape[0], *captures.shape[-2:]) != wanted:
+    if (shape[0], *shape[-2:]) != wanted:
         count, rows, columns = wanted
         raise ValueError(
-            f"captures have shape {captures.shape}; give ({count}, …, {rows}, {columns}), in the "
+            f"captures have shape {shape}; give ({count}, …, {rows}, {columns}), in the "
             "order of the cameras"
         )
 
