@@ -5,6 +5,7 @@ frequency. They lie on the half plane of a real DFT of the padded window.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar, Literal
 
@@ -12,11 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
-from thincam_jax._core.grids import Grid, fast_shape, same_parity
+from thincam_jax._core.grids import fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution
@@ -129,9 +131,10 @@ class WienerSynthesis(eqx.Module):
                 for row, ratio in zip(matrix, self.ratios, strict=True)
             ]
         )
-        self.prior = prior_spectrum(prior, Grid(self.padded, sensor.pitch), self.field_shape)
-        self.synthesis = checks.as_array(matrix.astype(self.uniform.dtype))
-        self.light = cameras.light(self.field_shape).astype(self.uniform.dtype)
+        dtype = self.uniform.dtype
+        self.prior = checks.as_array(prior_spectrum(prior, self.padded, self.field_shape, dtype))
+        self.synthesis = checks.as_array(matrix.astype(dtype))
+        self.light = cameras.light(self.field_shape).astype(dtype)
         self.weights = tuple(map(tuple, matrix.tolist()))
         self.object_pitch = cameras.pitch
 
@@ -321,16 +324,14 @@ def crop_field(full: Float[Array, "v u"], field_shape: tuple[int, int]) -> Float
     return rolled[:rows, :columns]
 
 
-@functools.partial(jax.jit, static_argnames=("prior", "field_shape"))
-def prior_spectrum(prior: Prior, grid: Grid, field_shape: tuple[int, int]) -> Float[Array, "v u"]:
-    """Scene spectrum with a mean of 1 over all frequencies."""
-    v = jnp.fft.ifftshift(grid.v)[:, None]
-    u = jnp.fft.ifftshift(grid.u)
-    if prior == "flat":
-        return jnp.ones((v.shape[0], grid.shape[1] // 2 + 1), v.dtype)
-    corner = 1 / (max(field_shape) * grid.pitch)
-    spectrum = 1 / (u**2 + v**2 + corner**2)
-    return (spectrum / jnp.mean(spectrum))[:, : grid.shape[1] // 2 + 1]
+def prior_spectrum(
+    prior: Prior, padded: tuple[int, int], field_shape: tuple[int, int], dtype: DTypeLike
+) -> Float[np.ndarray, "v u"]:
+    """Scene spectrum with a mean of 1 over all frequencies; in NumPy, with nothing to compile."""
+    v, u = (np.fft.fftfreq(n, 1 / max(field_shape)).astype(dtype) for n in padded)
+    corner = 1 if prior == "inverse_square" else math.inf
+    spectrum = 1 / (1 + (u**2 + v[:, None] ** 2) / corner)
+    return (spectrum / spectrum.mean())[:, : padded[1] // 2 + 1]
 
 
 def _axis_distance(padded, sensor_shape) -> tuple[np.ndarray, np.ndarray]:
