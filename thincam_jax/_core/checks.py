@@ -181,9 +181,14 @@ def as_array(value: Any, *, floating: bool = False) -> Array:
     return jax.lax.convert_element_type(array, array.dtype)
 
 
+def at_hand(value: Any, dtype: Any = None) -> Any:
+    """NumPy's array of known numbers, of which parts and shapes need no program; else JAX's."""
+    return (jnp if holds_traced(value) else np).asarray(value, dtype)
+
+
 def each(array: Any, axis: int = 0) -> list[Any]:
-    """Parts of an array along an axis; of a known one in NumPy, where nothing is compiled."""
-    return list((array if holds_traced(array) else np.asarray(array)).swapaxes(0, axis))
+    """Parts of an array along an axis."""
+    return list(at_hand(array).swapaxes(0, axis))
 
 
 def stacked(parts: Sequence[Any]) -> Array:

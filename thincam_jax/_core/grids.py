@@ -1,13 +1,13 @@
 """Sampling grids: where the samples of a plane lie, and their spatial frequencies."""
 
 import functools
+import itertools
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, DTypeLike, Float
 
 from thincam_jax._core import checks
@@ -117,7 +117,8 @@ def centred_frequencies(count: int, pitch: Float[Array, ""]) -> Float[Array, " c
 
 def fast_shape(shape: tuple[int, int], *, real: bool = False) -> tuple[int, int]:
     """The smallest shape that holds `shape` and transforms fast."""
-    rows, columns = (int(scipy.fft.next_fast_len(n, real=real) or n) for n in shape)
+    primes = 2 * 3 * 5 if real else 2 * 3 * 5 * 7 * 11  # a size has no other factors
+    rows, columns = (next(m for m in itertools.count(n) if pow(primes, 64, m) == 0) for n in shape)
     return rows, columns
 
 

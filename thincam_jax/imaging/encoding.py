@@ -9,6 +9,7 @@ import functools
 import io
 import logging
 import struct
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -113,7 +114,8 @@ def png_bytes(pixels: np.ndarray, gamma: float | int | None = None) -> bytes:
     buffer, info = io.BytesIO(), PIL.PngImagePlugin.PngInfo()
     if gamma is not None:
         info.add(b"gAMA", struct.pack(">I", min(max(round(1e5 / gamma), 1), 2**31 - 1)))
-    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info, compress_level=3)
+    # Of pictures with noise half the time, and a tenth smaller.
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG", pnginfo=info, compress_type=zlib.Z_RLE)
     return buffer.getvalue()
 
 

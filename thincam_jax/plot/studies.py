@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thincam_jax.imaging.encoding import as_picture
@@ -21,48 +20,30 @@ if TYPE_CHECKING:
     from thincam_jax.studies.study import Study, Target
 
 
-def draw_target(
-    study: "Study", target: "Target", capture: np.ndarray, evaluations: "Mapping[str, Evaluation]"
-) -> Figure:
-    """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
-    figure, whole, detail = draw_found(target, evaluations, with_capture=True)
-    raw = as_picture(capture / capture.max())
-    _show(whole, raw, "first raw capture")
-    _show_detail_of_capture(detail, raw, study)
-    return figure
-
-
 def truth_of(evaluations: "Mapping[str, Evaluation]") -> np.ndarray:
     """The scene on the pixels of the last method."""
     return list(evaluations.values())[-1].truth
 
 
 def draw_found(
-    target: "Target",
-    evaluations: "Mapping[str, Evaluation]",
-    *,
-    with_capture: bool = False,
-    figure: Figure | None = None,
-) -> tuple[Figure, Axes, Axes]:
-    """A target's scene and its reconstructions, whole and enlarged, and the first two axes.
-
-    These are left free for a capture, where there is to be one.
-    """
+    target: "Target", evaluations: "Mapping[str, Evaluation]", *, figure: Figure | None = None
+) -> Figure:
+    """A target's scene and its reconstructions, whole and enlarged."""
     truth = truth_of(evaluations)
     panels = [("scene", truth, "")]
     panels += [
         (name, one.image, one.scores.words.replace("; ", "\n")) for name, one in evaluations.items()
     ]
-    first, aspect = int(with_capture), truth.shape[0] / truth.shape[1]
-    drawn, wholes, details = _pairs_of_axes(first + len(panels), aspect, figure)
-    axes = zip(wholes[first:], details[first:], panels, strict=True)
+    aspect = truth.shape[0] / truth.shape[1]
+    drawn, wholes, details = _pairs_of_axes(len(panels), aspect, figure)
+    axes = zip(wholes, details, panels, strict=True)
     for ax, detail, (name, light, caption) in axes:
         image = target.shown(light)
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         part, label = enlarged_part(image, target)
         _show(detail, part, "")
         detail.set_xlabel(label, fontsize=9)
-    return drawn, wholes[0], details[0]
+    return drawn
 
 
 def draw_captures(study: "Study", captures: "Mapping[Exposure, Capture]") -> Figure:
@@ -71,6 +52,7 @@ def draw_captures(study: "Study", captures: "Mapping[Exposure, Capture]") -> Fig
     figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.9)
     for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=True), 1):
         image = captures[exposure].image
+        image = image[(..., *[slice(None, None, 1 + n // 512) for n in image.shape[-2:]])]
         title = f"{number}: {study.mask_of(exposure)},\n"
         _show(ax, as_picture(image / image.max()), f"{title}d {exposure.distance:.3g} mm")
     return figure
@@ -99,14 +81,6 @@ def _show(ax, image: np.ndarray, title: str) -> None:
     ax.imshow(np.clip(image, 0, 1), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     if title:
         ax.set_title(title, fontsize=9)
-
-
-def _show_detail_of_capture(ax, raw: np.ndarray, study: "Study") -> None:
-    detail = _middle(raw)
-    low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
-    _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
-    width = study.sensor.shape[1] * study.pitch / 3
-    ax.set_xlabel(f"middle {width:.2g} mm,\nstretched", fontsize=9)
 
 
 # The second layer of the USAF chart, with the finer ones inside: place of its centre down and right

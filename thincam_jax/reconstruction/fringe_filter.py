@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
@@ -64,20 +64,20 @@ class FringeFilter(eqx.Module):
         padded = fast_shape((rows, columns))
         object_distance = checks.positive("object_distance", cameras.object_distance, "mm")
         grid, ratio = Grid(padded, sensor.pitch), (camera.distance, object_distance)
-        shadows = jnp.stack([_shadow(c, object_distance) for c in found])
-        if bool(jnp.all(shadows == shadows[0])):
+        shadows = np.stack([_shadow(c, np.asarray(object_distance)) for c in found])
+        if (shadows == shadows[0]).all():
             shadows = shadows[:1]  # one filter for all
         self.inverse = _inverse_filter(grid, beta, ratio, shadows)
         self.weights = checks.as_array(weights.astype(self.inverse.dtype))
         self.light = cameras.light(self.field_shape).astype(sensor.pitch.dtype)
-        self.object_pitch = sensor.pitch * object_distance / camera.distance
+        self.object_pitch = cameras.pitch
 
-    def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
+    def __call__(self, captures: Numbers) -> Reconstruction:
         """The reconstruction of captures (capture, *batch, y, x), in the order of the cameras."""
-        captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
-        require_captures(captures, (len(self.weights), *self.sensor_shape))
-        count, *batch, rows, columns = captures.shape
-        image = each_image(self._image, captures.reshape(count, -1, rows, columns))
+        known = checks.at_hand(captures, self.object_pitch.dtype)
+        require_captures(known.shape, (len(self.weights), *self.sensor_shape))
+        count, *batch, rows, columns = known.shape
+        image = each_image(self._image, known.reshape(count, -1, rows, columns))
         image = image.reshape(*batch, *self.field_shape)
         return Reconstruction(image, self.object_pitch, "fringe_scanning")
 
@@ -129,11 +129,11 @@ class FringeScanning(AbstractSolver):
         return self.prepare(require_cameras(recording, self.name))(jnp.stack(recording.light))
 
 
-def _shadow(camera: LenslessCamera, object_distance: Number) -> Float[Array, "2"]:
+def _shadow(camera: LenslessCamera, object_distance: np.ndarray) -> Float[np.ndarray, "2"]:
     """Middle (y, x) of the shadow of a point of the scene's axis on the camera's sensor, mm."""
-    reach = camera.distance / object_distance
-    aside = 0.0 if camera.place is None else reach * camera.place
-    return (1 + reach) * camera.mask.centre + aside
+    reach = np.asarray(camera.distance) / object_distance
+    aside = 0.0 if camera.place is None else reach * np.asarray(camera.place)
+    return (1 + reach) * np.asarray(camera.mask.centre) + aside
 
 
 @jax.jit

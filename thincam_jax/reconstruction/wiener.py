@@ -5,6 +5,7 @@ frequency. They lie on the half plane of a real DFT of the padded window.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar, Literal
 
@@ -12,11 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
-from thincam_jax._core.grids import Grid, fast_shape, same_parity
+from thincam_jax._core.grids import fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution
@@ -129,33 +131,32 @@ class WienerSynthesis(eqx.Module):
                 for row, ratio in zip(matrix, self.ratios, strict=True)
             ]
         )
-        self.prior = prior_spectrum(prior, Grid(self.padded, sensor.pitch), self.field_shape)
-        self.synthesis = checks.as_array(matrix.astype(self.uniform.dtype))
-        self.light = cameras.light(self.field_shape).astype(self.uniform.dtype)
+        dtype = self.uniform.dtype
+        self.prior = checks.as_array(prior_spectrum(prior, self.padded, self.field_shape, dtype))
+        self.synthesis = checks.as_array(matrix.astype(dtype))
+        self.light = cameras.light(self.field_shape).astype(dtype)
         self.weights = tuple(map(tuple, matrix.tolist()))
         self.object_pitch = cameras.pitch
 
-    def __call__(
-        self, captures: Float[Array, "capture *batch y x"], noise_variance: Numbers
-    ) -> Reconstruction:
+    def __call__(self, captures: Numbers, noise_variance: Numbers) -> Reconstruction:
         """The reconstruction of captures (capture, *batch, y, x).
 
         `noise_variance`: that of a pixel, > 0, one number, one for each capture or (capture,
         *batch).
         """
-        captures = jnp.asarray(captures, dtype=self.uniform.dtype)
-        require_captures(captures, (len(self.uniform), *self.sensor_shape))
-        count, *batch, rows, columns = captures.shape
+        known = checks.at_hand(captures, self.uniform.dtype)
+        require_captures(known.shape, (len(self.uniform), *self.sensor_shape))
+        count, *batch, rows, columns = known.shape
         variance = checks.positive_all("noise_variance", jnp.asarray(noise_variance), "units²")
         if variance.shape != (count, *batch)[: variance.ndim]:
             raise ValueError(
                 f"noise_variance has shape {variance.shape}; give one number, {count} (one for "
                 f"each capture) or {(count, *batch)}"
             )
-        variance = variance.astype(captures.dtype)
+        variance = variance.astype(known.dtype)
         variance = variance.reshape(variance.shape + (1,) * (1 + len(batch) - variance.ndim))
         variance = jnp.broadcast_to(variance, (count, *batch)).reshape(count, -1)
-        image = each_image(self._image, captures.reshape(count, -1, rows, columns), variance)
+        image = each_image(self._image, known.reshape(count, -1, rows, columns), variance)
         return Reconstruction(image.reshape(*batch, *self.field_shape), self.object_pitch, "wiener")
 
     @eqx.filter_jit
@@ -256,20 +257,18 @@ def require_cameras(recording: Recording, method: str) -> Cameras:
     return recording.imaging_model
 
 
-def each_image(
-    filtered: Callable[..., Array], captures: Float[Array, "capture image y x"], *more: Array
-) -> Float[Array, "image m n"]:
-    """A filter's images of captures, and of `more` numbers (capture, image) of each, in turn."""
-    parts = (checks.each(part, axis=1) for part in (captures, *more))
+def each_image(filtered: Callable[..., Array], *numbers: Numbers) -> Float[Array, "image m n"]:
+    """A filter's images, one after the other, of `numbers` (capture, image, …)."""
+    parts = (checks.each(part, axis=1) for part in numbers)
     return checks.stacked([filtered(*part) for part in zip(*parts, strict=True)])
 
 
-def require_captures(captures: Array, wanted: tuple[int, int, int]) -> None:
+def require_captures(shape: tuple[int, ...], wanted: tuple[int, int, int]) -> None:
     """Require (capture, …, y, x) of the filter's numbers."""
-    if (captures.shape[0], *captures.shape[-2:]) != wanted:
+    if (shape[0], *shape[-2:]) != wanted:
         count, rows, columns = wanted
         raise ValueError(
-            f"captures have shape {captures.shape}; give ({count}, …, {rows}, {columns}), in the "
+            f"captures have shape {shape}; give ({count}, …, {rows}, {columns}), in the "
             "order of the cameras"
         )
 
@@ -325,16 +324,14 @@ def crop_field(full: Float[Array, "v u"], field_shape: tuple[int, int]) -> Float
     return rolled[:rows, :columns]
 
 
-@functools.partial(jax.jit, static_argnames=("prior", "field_shape"))
-def prior_spectrum(prior: Prior, grid: Grid, field_shape: tuple[int, int]) -> Float[Array, "v u"]:
-    """Scene spectrum with a mean of 1 over all frequencies."""
-    v = jnp.fft.ifftshift(grid.v)[:, None]
-    u = jnp.fft.ifftshift(grid.u)
-    if prior == "flat":
-        return jnp.ones((v.shape[0], grid.shape[1] // 2 + 1), v.dtype)
-    corner = 1 / (max(field_shape) * grid.pitch)
-    spectrum = 1 / (u**2 + v**2 + corner**2)
-    return (spectrum / jnp.mean(spectrum))[:, : grid.shape[1] // 2 + 1]
+def prior_spectrum(
+    prior: Prior, padded: tuple[int, int], field_shape: tuple[int, int], dtype: DTypeLike
+) -> Float[np.ndarray, "v u"]:
+    """Scene spectrum with a mean of 1 over all frequencies; in NumPy, with nothing to compile."""
+    v, u = (np.fft.fftfreq(n, 1 / max(field_shape)).astype(dtype) for n in padded)
+    corner = 1 if prior == "inverse_square" else math.inf
+    spectrum = 1 / (1 + (u**2 + v[:, None] ** 2) / corner)
+    return (spectrum / spectrum.mean())[:, : padded[1] // 2 + 1]
 
 
 def _axis_distance(padded, sensor_shape) -> tuple[np.ndarray, np.ndarray]:

@@ -82,16 +82,15 @@ def take(study: Study, exposure: Exposure, target: Target) -> Capture:
     return expose(study, exposure, noise_free(study, exposure, plane), target.number)
 
 
-def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
+def stacked(captures: Sequence[Capture]) -> tuple[np.ndarray, np.ndarray]:
     """Images (capture, *channel, y, x) and variances (capture, *channel)."""
-    images, variances = [c.image for c in captures], [c.variance for c in captures]
-    return checks.stacked(images), checks.stacked(variances)
+    return np.stack([c.image for c in captures]), np.stack([c.variance for c in captures])
 
 
 # The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
 _MINIMUM_ROWS = 7
 
-Reconstructor = Callable[[Array, Array], Reconstruction]
+Reconstructor = Callable[[np.ndarray, np.ndarray], Reconstruction]
 Contrasts = list[tuple[float, str, float]]
 
 
@@ -195,7 +194,7 @@ def reconstructor(
         return solve
     camera = study.camera(max(method.exposures, key=lambda exposure: float(exposure.distance)))
 
-    def even(captures: Array, variances: Array) -> Reconstruction:
+    def even(captures: np.ndarray, variances: np.ndarray) -> Reconstruction:
         found = solve(captures, variances)
         rows, columns = found.image.shape[-2:]
         fall = light_over_field(study.sensor, *tangents_of(camera, (rows, columns)))
@@ -232,10 +231,10 @@ def _solver(
     if isinstance(solver, Wiener):
         wiener = solver.prepare(cameras)
         if study.noise is None:
-            return lambda captures, variances: wiener(captures, estimate_variance(captures))
+            return lambda seen, _: wiener(seen, estimate_variance(checks.as_array(seen)))
         return wiener
 
-    def solved(captures: Array, variances: Array) -> Reconstruction:
+    def solved(captures: np.ndarray, variances: np.ndarray) -> Reconstruction:
         """Reconstruction on the crop model; without noise in the study it is estimated."""
         noise_variance = None if study.noise is None else variances
         recording = Recording(captures, cameras, noise_variance=noise_variance, background=0.0)
@@ -279,13 +278,14 @@ def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> 
     resolved, contrast = None, None
     if target.kind == "usaf1951":
         resolved, contrast = _resolution(method, target, image, float(grid.pitch))
+    aligned = align(image, truth)
     scores = Scores(
-        rounded(psnr(image, truth), 4),
-        round(ssim(image, truth), 5),
+        rounded(psnr(aligned, truth, aligned=False), 4),
+        round(ssim(aligned, truth, aligned=False), 5),
         round(float(grid.pitch), 6),
         resolved,
     )
-    return Evaluation(align(image, truth), truth, scores, contrast)
+    return Evaluation(aligned, truth, scores, contrast)
 
 
 def rounded(score: float, digits: int = 3) -> float | None:

@@ -381,7 +381,7 @@ class StudyResult:
         from thincam_jax.plot import studies as plot
         from thincam_jax.plot.frame import new_figure
 
-        return plot.draw_found(chosen, self.evaluations[name], figure=new_figure(1.0, 1.0))[0]
+        return plot.draw_found(chosen, self.evaluations[name], figure=new_figure(1.0, 1.0))
 
 
 def run(study: Study, targets: Sequence[Target]) -> StudyResult:

@@ -304,7 +304,7 @@ def test_pictures_alone_give_a_report(tmp_path, home):
     for method in scores.methods.values():
         assert method.targets["mtf"].resolved is None and method.resolved_mm is None
     assert not (folder.path / "figures" / "contrast.png").exists()
-    figures = {(folder.path / "figures" / n).read_bytes() for n in ("mtf.png", "target-mtf.png")}
+    figures = {(folder.path / "figures" / n).read_bytes() for n in ("mtf.png", "captures-mtf.png")}
     assert len(figures) == 2
     assert (folder.path / "report.html").exists()
 

@@ -233,7 +233,7 @@ class _DesignRun(Run):
         if stored is None or stored.designs != designs:
             shown: dict[str, Evaluation] = {}
             trials = simulate_trials(self.simulated, target, self.design.seeds, shown)
-            figure, *_ = draw_found(target, shown)
+            figure = draw_found(target, shown)
             self.folder.write(f"reconstructions-{slug(target.name)}.png", as_png(figure))
             stored = FinishedTarget(designs, trials)
             self.folder.finish(target.name, asdict(stored))

@@ -96,14 +96,10 @@ class _StudyRun(Run):
 
     def finish(self, target: Target) -> None:
         study, folder, found = self.study, self.folder, self.evaluations
-        first = self.captures[study.exposures[0]].image
         self._save_images(target)
         # No target's name can be taken for one of the study's own figures.
-        for kind, figure in (
-            ("target", plot.draw_target(study, target, first, found)),
-            ("captures", plot.draw_captures(study, self.captures)),
-        ):
-            folder.save_figure(f"{kind}-{slug(target.name)}", figure)
+        figure = plot.draw_captures(study, self.captures)
+        folder.save_figure(f"captures-{slug(target.name)}", figure)
         contrasts = {name: e.contrast for name, e in found.items() if e.contrast is not None}
         scores = {name: e.scores for name, e in found.items()}
         self.found[target.name], self.contrasts[target.name] = scores, contrasts

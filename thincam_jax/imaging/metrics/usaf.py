@@ -3,6 +3,7 @@
 Eager NumPy, not differentiable.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -136,10 +137,10 @@ def _levels(scaled: np.ndarray, element: UsafElement, pixels_per_chart: float) -
     bar = element.bar * pixels_per_chart
     length = 5 * bar * _INNER_LENGTH
     centre = along * pixels_per_chart + scaled.shape[0] / 2  # from the first pixel's border
-    edges = np.arange(scaled.shape[0])
-    overlap = np.minimum(edges + 1, centre + length / 2) - np.maximum(edges, centre - length / 2)
-    weights = np.maximum(overlap, 0.0)
-    profile = weights @ scaled / weights.sum()
+    low, high = centre - length / 2, centre + length / 2
+    edges = np.arange(math.floor(low), math.ceil(high))
+    weights = np.minimum(edges + 1, high) - np.maximum(edges, low)
+    profile = weights @ scaled[edges] / weights.sum()
     inside = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * _INNER_WIDTH
     middle = across * pixels_per_chart + (scaled.shape[1] - 1) / 2  # from the first pixel centre
     position = middle + bar * (np.arange(-2, 3)[:, None] + inside)
