@@ -80,7 +80,7 @@ def test_cost_where_there_is_none(name, solver, capsys):
     for seed, picture in enumerate(pictures):
         recording, truth = record(picture, "30", seed)
         seconds, scores = {0.0: [], None: []}, {}
-        for _ in range(4):  # the first compiles
+        for _ in range(6):  # the first compiles
             for background, times in seconds.items():
                 seen = dataclasses.replace(recording, background=background)
                 start = time.process_time()

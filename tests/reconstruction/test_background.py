@@ -12,11 +12,13 @@ import scipy.optimize
 import thincam_jax as tc
 from helpers import finite_difference
 from thincam_jax.imaging.operators import Matrix
+from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.reconstruction import solve_fixed_point
 from thincam_jax.reconstruction.implicit_gradient import NeumannSeries
 from thincam_jax.reconstruction.normal_equations import normal_equations
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
+    darkest,
     gradient,
     objective,
     scene_level,
@@ -287,3 +289,37 @@ def test_a_known_background_is_subtracted():
         np.testing.assert_allclose(objective(found, image), objective(plain, image), rtol=1e-6)
     with pytest.raises(ValueError, match=r"background has shapes .* give a number or a frame"):
         recording(background=np.zeros((3, 4)))
+
+
+def test_no_background_is_above_the_darkest_part_of_its_capture():
+    """Noise alone does not push the limit below it, and dead pixels do not count."""
+    rng, shape = np.random.default_rng(8), (61, 83)
+    light = np.clip(np.linspace(-1, 3, 83), 0, 3) * np.ones((61, 1))  # dark on the left
+    valid = rng.random(shape) > 0.3
+    valid[:8, :8] = False
+    captures = [0.5 + light + 0.1 * rng.normal(size=shape) for _ in range(40)]
+    parts = [(np.where(valid, c, 1e30)[None], 1.0 * valid) for c in captures]
+    highest = np.array([darkest([jnp.asarray(c)], [jnp.asarray(w)]) for c, w in parts])
+    assert highest.min() > 0.5 and highest.max() < 0.56
+
+
+@pytest.mark.thorough
+def test_a_dark_room_takes_no_more_iterations():
+    """Behind a PSF that fills the sensor, where uniform light explains a background as well."""
+    rng = np.random.default_rng(0)
+    waves = np.hypot(*np.meshgrid(*2 * [np.fft.fftfreq(96)], indexing="ij"))
+    relief = np.fft.fft2(rng.standard_normal((96, 96))) * np.exp(-400 * waves**2)
+    slopes = np.gradient(np.fft.ifft2(relief).real)
+    scale = 40 / np.fft.ifft2(relief).real.std()
+    y, x = (n + scale * s for n, s in zip(np.indices((96, 96)), slopes, strict=True))
+    psf = np.histogram2d(y.ravel(), x.ravel(), np.arange(97) - 0.5)[0]
+    optics = tc.Psfs(psf[None] / psf.sum(), field_shape=(191, 191))
+    (operator,) = tc.Recording(np.zeros((1, 96, 96)), optics).problem().operators
+    page = resize(middle_square(sample_image("page"), 191), (64, 64))
+    seen = operator(jnp.asarray(np.pad(page, ((63, 64), (63, 64))))[None, None])[0]
+    seen = seen + 0.03 * jnp.std(seen) * jnp.asarray(rng.normal(size=seen.shape))
+    known, found = (
+        tc.reconstruct(tc.Recording([seen], optics, background=b), tc.AdmmTV()).iterations
+        for b in (0.0, None)
+    )
+    assert found <= known

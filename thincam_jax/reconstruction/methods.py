@@ -357,7 +357,7 @@ class AdmmTV(AbstractRegularised):
         coarse, small, size = coarsened(problem, image, _COARSER)
         if size == 1:
             return self._from_nothing(problem, image, callback)
-        first = self._rough._from_nothing(coarse, small, None)
+        first = self._rough._from_nothing(coarse, small, None, rough=True)
         image = finer(first.image, problem.field_shape)
         if first.status in ("interrupted", "non_finite"):
             return dataclasses.replace(first, image=image)
@@ -371,24 +371,27 @@ class AdmmTV(AbstractRegularised):
             second = _joined(second, third)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds)
 
-    def _from_nothing(self, problem, image, callback) -> Outcome:
-        """Outcome from a uniform or black image; a biased camera's begins without uniform light."""
+    def _from_nothing(self, problem, image, callback, *, rough: bool = False) -> Outcome:
+        """Outcome from a uniform or black image; a biased camera's begins without uniform light.
+
+        - `rough`: see `splitting_of`.
+        """
         lit = bool(np.any(np.asarray(image)))
         # Whole chunks between two checks: a callback sees every tenth iteration throughout.
         count = CHUNK * round(_FIRST_PART * self.iterations / CHUNK)
         begin = Schedule(count, self.tolerance, adapt_until=min(_BALANCED, count // 2))
         first = begin_without(problem, image, begin, callback) if lit and count else None
         if first is None:
-            return self._by_admm(problem, image, callback)
+            return self._by_admm(problem, image, callback, rough=rough)
         if first.status in ("stopped", "interrupted", "non_finite"):
             return first
         try:
-            second = self._by_admm(problem, first.image, callback, first.iterations)
+            second = self._by_admm(problem, first.image, callback, first.iterations, rough=rough)
         except KeyboardInterrupt:  # before its iterations, which keep their own best image
             return dataclasses.replace(first, status="interrupted")
         return _joined(first, second)
 
-    def _by_admm(self, problem, image, callback, done: int = 0) -> Outcome:
+    def _by_admm(self, problem, image, callback, done: int = 0, *, rough: bool = False) -> Outcome:
         """Outcome from any image."""
         half, planes = (self.iterations - done) // 2, problem.image_shape[-3]
         until = done + (min(_BALANCED, half) if planes == 1 else half)
@@ -396,7 +399,7 @@ class AdmmTV(AbstractRegularised):
         # About its minimum the objective changes by the square of the image's change.
         settled = 10 * self.tolerance * min(1.0, self.tolerance / _FINE)
         schedule = Schedule(*limits, adapt_until=until, done=done, settled=settled)
-        method = in_parallel(problem, admm_method)
+        method = in_parallel(problem, functools.partial(admm_method, rough=rough))
         return iterate(method, image, schedule, callback=callback)
 
 

@@ -1,5 +1,6 @@
 """The inverse problem of a reconstruction, for any camera with a linear operator."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -10,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.grids import block_sum
 from thincam_jax._core.precision import product
 from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Stacked
@@ -188,13 +190,44 @@ def residuals(problem: InverseProblem, image: Image):
 
 
 def with_background(
-    background: Background, weight: Float[Array, "..."], difference: Float[Array, "..."], axes: int
+    background: Background,
+    weight: Float[Array, "..."],
+    difference: Float[Array, "..."],
+    axes: int,
+    highest: Float[Array, "..."] | float = math.inf,
 ) -> Float[Array, "..."]:
-    """A f + b − g of the difference A f − g, over its last axes."""
+    """A f + b − g of the difference A f − g, over its last axes.
+
+    - `highest`: upper limit of b, of one that is not negative.
+    """
     if background == "known":
         return difference
     level = weighted_mean(weight, difference, axes)
-    return difference - (jnp.minimum(level, 0) if background == "nonnegative" else level)
+    return difference - (jnp.clip(level, -highest, 0) if background == "nonnegative" else level)
+
+
+# Side of the blocks of pixels of which the darkest limits a background, and its standard errors.
+_BLOCK, _ERRORS = 8, 4
+
+
+@quickly_compiled
+def darkest(
+    captures: Sequence[Float[Array, "..."]], weights: Sequence[Float[Array, "..."]]
+) -> tuple[Float[Array, "..."], ...]:
+    """Highest background of each capture: the mean of its darkest block, and four errors of it."""
+
+    def of(capture, weight):
+        whole = jnp.broadcast_to(weight, jnp.broadcast_shapes(weight.shape, capture.shape))
+        capture = jnp.where(whole > 0, capture, 0)
+        inner = tuple(slice(n - n % _BLOCK) for n in capture.shape[-2:])
+        sums = (block_sum((whole * capture**n)[..., *inner], _BLOCK) for n in range(3))
+        count, light, squares = sums
+        mean = light / or_one(count)
+        variance = jnp.maximum(squares / or_one(count) - mean**2, 0) / or_one(count)
+        limits = jnp.where(count > _BLOCK**2 / 2, mean + _ERRORS * jnp.sqrt(variance), jnp.inf)
+        return jnp.min(limits, axis=(-2, -1), keepdims=True)
+
+    return tuple(map(of, captures, weights))
 
 
 def lit(problem: InverseProblem, image: Image) -> tuple[Bool[Array, "..."], ...]:

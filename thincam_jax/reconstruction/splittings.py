@@ -55,6 +55,7 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,
     convolutions,
+    darkest,
     lit,
     or_one,
     with_background,
@@ -76,19 +77,27 @@ _SETS = 10  # of backgrounds that are positive, at most
 
 
 def admm_method(
-    problem: InverseProblem, near: Image | None = None, *, relaxation: Number = RELAXATION
+    problem: InverseProblem,
+    near: Image | None = None,
+    *,
+    relaxation: Number = RELAXATION,
+    rough: bool = False,
 ) -> AdmmMethod:
     """ADMM for a problem, with the splitting that suits its operators; see `splitting_of`.
 
     From a `near` image penalties stay, and steps are not judged.
     """
-    return AdmmMethod(problem, splitting_of(problem, near), relaxation, judged=near is None)
+    splitting = splitting_of(problem, near, rough=rough)
+    return AdmmMethod(problem, splitting, relaxation, judged=near is None)
 
 
-def splitting_of(problem: InverseProblem, near: Image | None = None) -> AbstractSplitting:
+def splitting_of(
+    problem: InverseProblem, near: Image | None = None, *, rough: bool = False
+) -> AbstractSplitting:
     """The splitting that suits the operators of a problem.
 
     - `near`: a start image with the right low frequencies, to which penalties are suited.
+    - `rough`: whether the image is only a start; see `FourierSplitting`.
     """
     variation = problem.regulariser
     if not isinstance(variation, TotalVariation):
@@ -99,13 +108,17 @@ def splitting_of(problem: InverseProblem, near: Image | None = None) -> Abstract
     operators = convolutions(problem)
     if operators is None:
         return DirectSplitting(problem, variation)
-    return FourierSplitting(problem, operators, variation, near)
+    return FourierSplitting(problem, operators, variation, near, rough=rough)
 
 
 class FourierSplitting(AbstractSplitting):
     """The splitting of a problem whose operators are convolutions on one window.
 
     The largest weight of a capture is part of its operator, as `gains`; `weights` are relative.
+
+    Light only adds to a background, which is not above the darkest part of its capture. A `rough`
+    image for a start keeps to that, and does not first take all light for background. The final
+    one need not: a measured PSF may be negative by errors of its own.
     """
 
     operators: tuple[CropConvolution, ...]
@@ -113,6 +126,7 @@ class FourierSplitting(AbstractSplitting):
     captures: tuple[Float[Array, "*batch channel y x"], ...]
     weights: tuple[Float[Array, "..."], ...]
     normal: "NormalInverse"
+    highest: tuple[Float[Array, "..."], ...] | None
     background: Background = eqx.field(static=True)
 
     def __init__(
@@ -121,6 +135,8 @@ class FourierSplitting(AbstractSplitting):
         operators: tuple[CropConvolution, ...],
         variation: TotalVariation,
         near: Image | None = None,
+        *,
+        rough: bool = False,
     ):
         units = _units(problem, operators, variation)
         # The operators themselves: a compiled function would return copies.
@@ -128,6 +144,8 @@ class FourierSplitting(AbstractSplitting):
         self.gains, self.captures, self.weights, self.tau, self.normal, self.image_unit = units
         self.variation, self.nonnegative = variation, problem.nonnegative
         self.background = problem.background
+        is_limited = rough and self.background == "nonnegative"
+        self.highest = darkest(self.captures, self.weights) if is_limited else None
         self.penalties = _default_penalties(self.operators, self.gains)
         if near is not None:
             unit = self.image_unit
@@ -135,7 +153,9 @@ class FourierSplitting(AbstractSplitting):
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
         scaled = tuple(g / self.image_unit * c for g, c in zip(self.gains, captures, strict=True))
-        return eqx.tree_at(lambda s: s.captures, self, scaled)
+        highest = self.highest and darkest(scaled, self.weights)
+        where, none = lambda s: (s.captures, s.highest), {"is_leaf": lambda part: part is None}
+        return eqx.tree_at(where, self, (scaled, highest), **none)
 
     def start(self, image: Image):
         operator = self.operators[0]
@@ -151,12 +171,7 @@ class FourierSplitting(AbstractSplitting):
     def reflected(self, state: State):
         operator, window = self.operators[0], self.operators[0].window
         masks = field_masks(operator.field_shape, window, operator.field_corner)
-        data = [
-            q + 2 * self._data_pull(o, capture, weight, q)
-            for q, o, capture, weight in zip(
-                state.data, self.operators, self.captures, self.weights, strict=True
-            )
-        ]
+        data = [q + 2 * self._data_pull(k, q) for k, q in enumerate(state.data)]
         framed = within_field(state.slopes, masks)
         shrunk = self.variation.shrink(framed, self.tau / self.penalties.variation)
         slopes = [q + 2 * (z - f) for q, z, f in zip(state.slopes, shrunk, framed, strict=True)]
@@ -175,14 +190,16 @@ class FourierSplitting(AbstractSplitting):
             total = total + factor * operator.spread(jnp.fft.rfft2(data))
         return self._images(self.normal(total, penalties))
 
-    def _data_pull(self, operator: CropConvolution, capture, weight, q):
+    def _data_pull(self, index: int, q):
         """z − q of a capture: zero outside of the sensor; z is best with its background.
 
         The minimum over z has the weights of `share` for the background.
         """
-        seen = cut(q, operator.sensor_corner, operator.sensor_shape)
+        operator, weight = self.operators[index], self.weights[index]
+        difference = cut(q, operator.sensor_corner, operator.sensor_shape) - self.captures[index]
         share = weight / (weight + self.penalties.data)
-        excess = with_background(self.background, share, seen - capture, 2)
+        highest = math.inf if self.highest is None else self.highest[index]
+        excess = with_background(self.background, share, difference, 2, highest)
         return place(-share * excess, operator.sensor_corner, operator.window)
 
     def _images(self, spectrum) -> State:
