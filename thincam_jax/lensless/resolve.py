@@ -374,6 +374,16 @@ AVERAGES = 1 / 4
 _SLOW = 1e10
 
 
+def require_factored(mask: AbstractMask) -> AbstractFactoredMask:
+    """The mask, or one line that says which models can be used without terms."""
+    if not isinstance(mask, AbstractFactoredMask):
+        raise TypeError(
+            "model 'separable' needs a mask of few separable terms, such as FresnelZoneAperture; "
+            f"for a {type(mask).__name__} use {other_models(mask)}"
+        )
+    return mask
+
+
 def resolve(
     camera: LenslessCamera,
     path: LightPath,
@@ -391,11 +401,8 @@ def resolve(
     given = method = as_method(model, pixel_integration)
     tolerance = AVERAGES * (method.field_tolerance or 0.0)
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
-    if method.model == "separable" and not isinstance(mask, AbstractFactoredMask):
-        raise TypeError(
-            "model 'separable' needs a mask of few separable terms, such as FresnelZoneAperture; "
-            f"for a {type(mask).__name__} use {other_models(mask)}"
-        )
+    if method.model == "separable":
+        require_factored(mask)
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
     averaged = method.pixel_integration and method.nodes is None
