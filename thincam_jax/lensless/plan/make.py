@@ -51,6 +51,8 @@ from thincam_jax.lensless.plan.seen import (
 _FEW_NODES, _ABOVE_EDGES = 6, 2.5
 # What float32's convolution leaves of a capture.
 _CONVOLUTION_ROUNDING = 1.5e-6
+# What double precision leaves of it, also where no light but what is diffracted meets the sensor.
+_DOUBLE_ROUNDING = 1e-11
 # Below this tolerance nearly every PSF is needed, and finding which costs more than it saves.
 _EVERYTHING = 3e-5
 
@@ -71,7 +73,7 @@ def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
 
     ordered = sorted(methods, key=work)
     method, error = until_met(((m, _method_error(seen, m)) for m in ordered), tolerance)[-1]
-    return (method, error) if error <= tolerance else (FULL, 0.0)
+    return (method, error) if error <= tolerance else (FULL, _DOUBLE_ROUNDING)
 
 
 def _choose_samples(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
@@ -108,7 +110,7 @@ def _samples_at(
 
 def _method_error(seen: SeenScene, method: PsfMethod) -> float:
     if method == FULL:
-        return 0.0
+        return _DOUBLE_ROUNDING
     worst = 0.0
     for (wavelength, distance), exact in zip(seen.corners, seen.references, strict=True):
         assert isinstance(seen.probe, TransferProbe)
