@@ -93,7 +93,7 @@ def test_second_run_reads_what_the_first_has_compiled(tmp_path):
     variables = {**kept, "PYTHONPATH": path, "THINCAM_CACHE": "on", **place}
 
     def run():
-        command = [sys.executable, "-m", "thincam_jax.commands.start", "doctor"]
+        command = [sys.executable, "-m", "thincam_jax.commands.start", "doctor", "--all"]
         done = subprocess.run(command, capture_output=True, text=True, env=variables, timeout=120)
         assert (done.returncode, done.stderr) == (0, "")
         assert "compiled sums: right" in done.stdout

@@ -196,7 +196,7 @@ GUARDED = {"JAX_TRANSFER_GUARD": "disallow", "JAX_NUMPY_RANK_PROMOTION": "raise"
     [
         (["explain", ROOT / "configs/fza_superresolution.yaml"], "", ASCII, 0, "\\u03b2"),
         (["schema", "study"], "", ASCII, 0, "fill_factor \\u2264 1"),
-        (["doctor"], "", {"MPLBACKEND": "banana"}, 0, "devices: cpu:0"),
+        (["doctor", "--all"], "", {"MPLBACKEND": "banana"}, 0, "devices: cpu:0"),
         (["doctor"], "", NO_GPU, 2, "JAX cannot start with JAX_PLATFORMS=cuda"),
         (
             ["doctor"],

@@ -362,7 +362,7 @@ def _enlarged(lines: Float[Array, "n *rest"], count: int, ratio: float) -> Float
     taken = first + np.arange(width)
     away = place - taken
     weights = np.sinc(away) * np.sinc(away / _LOBES) * (np.abs(away) < _LOBES)
-    inside = np.abs(place - (whole - 1) / 2) <= whole / 2
+    inside = np.abs(place - (whole - 1) / 2) < whole / 2 - 1e-9  # not on the rim
     total = np.where(inside, weights.sum(axis=-1, keepdims=True), 1)
     weights = (weights * inside / total).astype(lines.dtype)
     enlarged = jnp.einsum("bmn,bn...->bm...", weights, lines[taken[:, 0]], precision="highest")
