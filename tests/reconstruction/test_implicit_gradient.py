@@ -13,7 +13,7 @@ import pytest
 from reconstruction import scenes
 
 import thincam_jax as tc
-from helpers import count_traces, finite_difference, relative_l2
+from helpers import AS_IN_USE, count_traces, finite_difference, relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.reconstruction.admm import Penalties
@@ -171,7 +171,8 @@ def temporary(iterations: int, *, gradient: bool) -> int:
         return jnp.sum(solve_fixed_point(other, first, iterations=iterations).image)
 
     function = jax.grad(total) if gradient else total
-    analysis = jax.jit(function).lower(problem.tau, problem).compile().memory_analysis()
+    lowered = jax.jit(function).lower(problem.tau, problem)
+    analysis = lowered.compile(compiler_options=AS_IN_USE).memory_analysis()
     return analysis.temp_size_in_bytes
 
 

@@ -217,7 +217,8 @@ def _judged(penalties: Penalties, states, settled, relaxation) -> AdmmState:
     gap = jax.tree.map(lambda a, b: (a - b) / relaxation, after, before)
     image = jax.tree.map(jnp.add, old, gap)  # K f
     move, pull = (jax.tree.map(jnp.subtract, *pair) for pair in ((new, old), (after, new)))
-    gaps, *sizes, moved, force, begun = squared_sizes(gap, image, old, move, pull, before)
+    gaps, begun = squared_sizes(gap, before)  # alone: loops that end by the change want no others
+    *sizes, moved, force = squared_sizes(image, old, move, pull)
     size = jnp.maximum(*sizes)
     weights = jnp.stack(jax.tree.leaves(penalties))
 
