@@ -33,7 +33,6 @@ EXTRAS = {
     "raw": "DNG and raw files of cameras",
     "containers": "HDF5 and MATLAB 7.3",
     "datasets": "data sets in Parquet",
-    "deepinv": "priors of deepinv",
     "layout": "masks for lithography (GDS)",
 }
 
