@@ -16,8 +16,9 @@ from thincam_jax.imaging.refractive_index import CauchyIndex
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, nm, um
 from thincam_jax.waveguide import planning, probe
+from thincam_jax.waveguide.camera import seen_size
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres
-from thincam_jax.waveguide.system import LitPlane, seen_size, smeared_rays, system_matrix
+from thincam_jax.waveguide.system import LitPlane, smeared_rays, system_matrix
 
 SHAPE, CELLS = (32, 12), (24, 28)
 

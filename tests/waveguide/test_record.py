@@ -13,7 +13,7 @@ from thincam_jax import waveguide as wg
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.targets import resize
 from thincam_jax.units import nm
-from thincam_jax.waveguide.system import seen_size
+from thincam_jax.waveguide.camera import seen_size
 
 PICTURE = skimage.data.camera()[::16, ::16] / 255.0
 
@@ -38,5 +38,7 @@ def test_behind_a_screen():
     both = tc.Scene([plane, tc.ImagePlane(PICTURE[:24], 300.0, 65.0)], 550 * nm)
     two = tc.record(camera, both).imaging_model.operators[0]
     assert two.in_shape == (2, *cells.shape)
+    with pytest.raises(TypeError, match="is of a mask's PSF; leave it out here"):
+        tc.record(camera, both, model="geometric")
     with pytest.raises(TypeError, match=r"give a LenslessCamera, several, a Mosaic, or a waveg"):
         tc.record(camera.sensor, both)

@@ -15,10 +15,11 @@ from helpers import relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.units import nm, um
+from thincam_jax.waveguide.camera import seen_size
 from thincam_jax.waveguide.efficiency import diffraction_efficiency
 from thincam_jax.waveguide.rays import pixel_centres
 from thincam_jax.waveguide.smear import direct_rays, trace_band
-from thincam_jax.waveguide.system import LitPlane, planes_operator, seen_size, system_matrix
+from thincam_jax.waveguide.system import LitPlane, planes_operator, system_matrix
 
 PIXELS = [(0.0, 0.0), (1.0536, 0.0), (-1.0536, -1.0536)]
 

@@ -64,6 +64,8 @@ def record(
     """
     noise = GaussianNoise(noise) if isinstance(noise, float | int) else noise
     if not isinstance(camera, LenslessCamera | Mosaic | Sequence):
+        if model != "separable":
+            raise TypeError(f"model = {checks.shown(model)} is of a mask's PSF; leave it out here")
         return _behind_a_screen(camera, scene, noise, random_key(key))
     exposed: list[Any] = [camera] if isinstance(camera, LenslessCamera | Mosaic) else list(camera)
     cameras: list[LenslessCamera] = list(camera.cameras) if isinstance(camera, Mosaic) else exposed
@@ -101,7 +103,7 @@ def _variances(noise: AbstractNoise | None, frames: Sequence[Any]) -> list[float
 def _behind_a_screen(camera: Any, scene: Scene, noise: AbstractNoise | None, key: Any) -> Recording:
     """A recording of as many cells in each plane, at most as large as what a pixel sees."""
     from thincam_jax import waveguide as wg
-    from thincam_jax.waveguide.system import seen_size
+    from thincam_jax.waveguide.camera import seen_size
 
     if not isinstance(camera, wg.SeeThroughCamera):
         raise TypeError(

@@ -134,6 +134,11 @@ class ObjectPlane(Module):
         return Rectangle(self.centre, self.pitch * np.asarray(self.shape, self.width.dtype))
 
 
+def seen_size(camera: SeeThroughCamera, plane: ObjectPlane) -> Float[Array, ""]:
+    """Side of the square of the object's plane that a pixel sees, mm."""
+    return camera.sensor.pitch * (camera.lens_distance + plane.distance) / camera.focal_distance
+
+
 def without_dispersion(camera: SeeThroughCamera) -> SeeThroughCamera:
     """The camera whose indices are, at every wavelength, those of its middle's colour."""
     screen = camera.screen

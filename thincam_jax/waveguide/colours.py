@@ -38,13 +38,13 @@ from thincam_jax._core.precision import AccuracyWarning, product
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.units import nm
-from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera
+from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera, seen_size
 from thincam_jax.waveguide.efficiency import axial_band, in_blocks, least_nodes, unpolarised
 from thincam_jax.waveguide.hologram import VolumeHologram
 from thincam_jax.waveguide.lens import lens_views
 from thincam_jax.waveguide.rays import at_rear, on_object, pixel_centres, shift, straight_on
 from thincam_jax.waveguide.smear import SmearedRays, equal_parts, guided_band, meets
-from thincam_jax.waveguide.system import bandwidth, seen_size, system_matrix
+from thincam_jax.waveguide.system import bandwidth, system_matrix
 
 # Neighbouring gratings nearer than so many widths of a band: at Δn of 0.006 to 0.03 and 6 to 24 nm
 # apart integrals are up to 15 % off below it, at most 2 % above.

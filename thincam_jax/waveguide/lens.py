@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera
+from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera, seen_size
 from thincam_jax.waveguide.rays import RayStatus, trace
 
 # Blurs, in fields of a pixel, that change nothing. One ring per such field of the blur's radius
@@ -98,5 +98,4 @@ def blur_radius(camera: SeeThroughCamera, plane: ObjectPlane, orders: int) -> fl
     edges = np.stack([seen(*place).points for place in ((0, 1), (0, -1), (1, 0), (-1, 0))])
     away = np.linalg.norm((edges - middle.points)[..., :2], axis=-1)
     met = np.asarray(middle.status) == RayStatus.OK
-    field = camera.sensor.pitch * (camera.lens_distance + plane.distance) / camera.focal_distance
-    return float(np.max(away * met)) / float(field)
+    return float(np.max(away * met)) / float(seen_size(camera, plane))

@@ -13,7 +13,12 @@ import numpy as np
 from thincam_jax._core import checks
 from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax.imaging.operators import Separable, Sparse
-from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera, without_dispersion
+from thincam_jax.waveguide.camera import (
+    ObjectPlane,
+    SeeThroughCamera,
+    seen_size,
+    without_dispersion,
+)
 from thincam_jax.waveguide.colours import ColourCamera, Crosstalk, colour_system
 from thincam_jax.waveguide.probe import MARGIN, ColourProbe, ScreenProbe, as_numpy, cross, mean_x
 from thincam_jax.waveguide.system import (
@@ -21,7 +26,6 @@ from thincam_jax.waveguide.system import (
     footprints,
     planes_operator,
     require_same,
-    seen_size,
     smeared_rays,
 )
 

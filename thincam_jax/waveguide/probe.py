@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from thincam_jax._core.precision import Precision, cast
 from thincam_jax.imaging.refractive_index import ConstantIndex
-from thincam_jax.waveguide.camera import SeeThroughCamera, without_dispersion
+from thincam_jax.waveguide.camera import SeeThroughCamera, seen_size, without_dispersion
 from thincam_jax.waveguide.colours import ColourCamera, modelled
 from thincam_jax.waveguide.lens import LensView, lens_views
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres, slopes, trace
 from thincam_jax.waveguide.smear import SmearedRays, direct_rays
-from thincam_jax.waveguide.system import LitPlane, footprints, in_cells, seen_size, smeared_rays
+from thincam_jax.waveguide.system import LitPlane, footprints, in_cells, smeared_rays
 
 # Numbers of ghosts and of parts of the band that are tried; the last is the reference.
 _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -55,7 +55,8 @@ class ScreenProbe:
             view.share * self.seen(self.rays(True, "float64", view=view), view=view)
             for view in self.views
         )
-        reference = np.concatenate([reference, [self.direct(self.views)]])
+        self.straight = {False: self.direct((self.middle,)), True: self.direct(self.views)}
+        reference = np.concatenate([reference, [self.straight[True]]])
         self._refer(reference, rays.weight[-1, 1:] / self.level, seen)
 
     def _draw(self, camera: SeeThroughCamera, planes: list, images: Any) -> np.ndarray:
@@ -161,9 +162,9 @@ class ScreenProbe:
     def capture(self, **way: Any) -> np.ndarray:
         """Capture at the pixels, by one way of the `options`."""
         how = way["dispersion"] or not self.dispersive, way["precision"], way["smear"]
-        views = self.views if way.get("lens") else (self.middle,)
-        found = self.direct(views)
-        for view in views:
+        lens = way.get("lens", False)
+        found = self.straight[lens]
+        for view in self.views if lens else (self.middle,):
             rays = self.rays(*how, view=view)
             found = found + view.share * self.seen(rays, way["orders"], view).sum(axis=0)
         return found

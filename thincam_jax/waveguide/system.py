@@ -16,7 +16,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators import Sparse
-from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera
+from thincam_jax.waveguide.camera import ObjectPlane, SeeThroughCamera, seen_size
 from thincam_jax.waveguide.lens import LensView, lens_views
 from thincam_jax.waveguide.rays import check_screen, pixel_centres, trace
 from thincam_jax.waveguide.smear import SmearedRays, direct_rays, trace_band
@@ -79,11 +79,6 @@ def in_cells(
     numbers, centre = np.asarray(plane.shape, float), np.asarray(plane.centre, float)
     places = (points.astype(float) - centre) / float(plane.pitch) + numbers / 2
     return np.moveaxis(places, -1, 0)
-
-
-def seen_size(camera: SeeThroughCamera, plane: ObjectPlane) -> Float[Array, ""]:
-    """Side of the square of the object's plane that a pixel sees, mm."""
-    return camera.sensor.pitch * (camera.lens_distance + plane.distance) / camera.focal_distance
 
 
 def smeared_rays(

@@ -28,9 +28,10 @@ from thincam_jax.imaging.refractive_index import changed
 from thincam_jax.measured.calibration.problem import Status, covariance, hardly_seen, verdict
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import ObjectPlane, Screen, SeeThroughCamera, VolumeHologram
+from thincam_jax.waveguide.camera import seen_size
 from thincam_jax.waveguide.rays import pixel_centres, trace
 from thincam_jax.waveguide.smear import trace_band
-from thincam_jax.waveguide.system import seen_size, system_operator
+from thincam_jax.waveguide.system import system_operator
 
 # Parameters that can be fitted, with a step of small effect on an image.
 PARAMETERS = {

@@ -28,9 +28,10 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import MODELS, Model
 from thincam_jax.lensless.psf import psf
+from thincam_jax.waveguide.camera import seen_size
 from thincam_jax.waveguide.screen_to_sensor import ghost_images, ghost_psfs
 from thincam_jax.waveguide.smear import SmearedRays
-from thincam_jax.waveguide.system import seen_size, system_matrix
+from thincam_jax.waveguide.system import system_matrix
 
 MASK_MISTAKES = ("none", "shift_invariant", "no_ghosts")
 _STEPS = 6  # to a first image, each of which leaves some per cent of the error
