@@ -24,7 +24,6 @@ from thincam_jax.lensless.masks.base import has_few_terms, zone_orders
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes
 from thincam_jax.lensless.psf import spectral_psf
-from thincam_jax.lensless.resolve import AVERAGES
 
 
 def light_over_field(
@@ -223,7 +222,7 @@ def _averages(
     if method.model != "separable" or not has_few_terms(camera.mask):
         return 0.0
     path = camera.path(min(float(np.asarray(w)) for w, _ in colours), object_distance)
-    tolerance = AVERAGES * (method.field_tolerance or 0.0)
+    tolerance = method.averages_tolerance
     nodes = pixel_nodes(camera.mask, grid, path, method.float_type, tolerance)
     return average_error(camera.mask, grid, path, method.nodes or nodes)
 

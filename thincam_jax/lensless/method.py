@@ -147,6 +147,15 @@ class PsfMethod:
         """The precision; float32 by default."""
         return self.precision or "float32"
 
+    @property
+    def averages_tolerance(self) -> float:
+        """What averages over pixels may leave: a quarter of the field's tolerance.
+
+        Nothing where it is 1: that asks for the light of every point, not for a coarse PSF.
+        """
+        given = self.field_tolerance or 0.0
+        return given / 4 if given < 1 else 0.0
+
 
 def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMethod:
     """A model's settings, given or by its name; averaged over pixels unless either says no."""

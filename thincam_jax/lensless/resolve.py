@@ -368,8 +368,6 @@ def convolution_cost(
     return Cost(flops, int(itemsize * window * (3 * images + 4)))
 
 
-# Part of the tolerance over a field that averages over pixels may take.
-AVERAGES = 1 / 4
 # Operations of samples chosen by default, some ten seconds, that are warned of.
 _SLOW = 1e10
 
@@ -399,7 +397,7 @@ def resolve(
     """
     mask, grid = camera.mask, camera.sensor.grid
     given = method = as_method(model, pixel_integration)
-    tolerance = AVERAGES * (method.field_tolerance or 0.0)
+    tolerance = method.averages_tolerance
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
     if method.model == "separable":
         require_factored(mask)

@@ -103,10 +103,10 @@ def _factors(camera, scene: Scene, grid: Grid, method: PsfMethod):
     rows, columns = [], []
     for wavelength, weight in light.colours:
         path = camera.path(wavelength, plane.distance)
-        if method.pixel_integration:
+        nodes = method.nodes
+        if method.pixel_integration and nodes is None:
             nodes = pixel_nodes(camera.mask, grid, path, method.float_type)
-            method = replace(method, nodes=nodes)
-        terms = closed_terms(camera.mask, grid, path, method)
+        terms = closed_terms(camera.mask, grid, path, replace(method, nodes=nodes))
         y, x = terms.real_factors()
         rows.append(weight.astype(y.dtype) * y)
         columns.append(x)

@@ -6,7 +6,7 @@ import scipy.signal
 from lensless.plan.scenes import camera
 
 import thincam_jax as tc
-from thincam_jax.lensless.method import CLOSED, PIXEL_NODES, PsfMethod, models_of
+from thincam_jax.lensless.method import CLOSED, PsfMethod, models_of
 from thincam_jax.lensless.plan.make import fit, order_of_columns
 from thincam_jax.lensless.plan.seen import (
     TransferProbe,
@@ -42,12 +42,11 @@ def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):
     own = camera()
     frequencies = sample_frequencies(max(KERNEL))
     probe = TransferProbe(own, KERNEL, frequencies)
-    nodes = PIXEL_NODES if model == "separable" and average else None  # `psf` may take more
     h = tc.psf(
         own.on_grid(tc.Grid(KERNEL, own.sensor.pitch)),
         wavelength=500 * nm,
         object_distance=250.0,
-        model=PsfMethod(model, "float64", average, nodes=nodes),
+        model=PsfMethod(model, "float64", average),
     )
     expected = direct(h, frequencies)
     scale = np.abs(expected).max()

@@ -36,7 +36,7 @@ from thincam_jax.lensless.masks.base import (
     term_count,
     zone_orders,
 )
-from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.run import CapturePlan, effects_of
 from thincam_jax.lensless.plan.seen import (
     FULL,
@@ -168,7 +168,7 @@ def _fewest(
 def _quick(seen: SeenScene, method: PsfMethod, wavelength: float, distance: float):
     """H; and, where every point has its own PSF, those of the field's edges after it."""
     few = seen.tolerance > _ABOVE_EDGES * seen.edge_wave
-    own = replace(method, nodes=_FEW_NODES if few else PIXEL_NODES, field_tolerance=None)
+    own = replace(method, nodes=_FEW_NODES if few else None, field_tolerance=None)
     probe = seen.probe
     found = [probe.quick(wavelength, distance, own)]
     if method.field_tolerance is not None:
