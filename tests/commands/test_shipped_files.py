@@ -3,6 +3,7 @@
 import json
 import re
 
+import numpy as np
 import pytest
 import yaml
 from commands.test_cli import call, one_line
@@ -10,6 +11,7 @@ from jsonschema import Draft202012Validator
 
 from helpers import ROOT
 from thincam_jax.commands.kinds import KINDS, load_experiment, read_kind
+from thincam_jax.measured.calibration.alignment import Alignment
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 SCHEMAS = ROOT / "configs/schemas"
@@ -75,6 +77,17 @@ def but(*slow):
     return pytest.mark.parametrize("path", files, ids=lambda path: path.stem)
 
 
+def options_of(path, folder):
+    """Options in place of what is not shipped: photographs, and what another run has found."""
+    if path.stem == "denoiser":
+        return ["--set", "sources=[{name: drawn, kind: drawn, count: 2}]"]
+    if path.stem == "rig_pairs":
+        found = np.array([1.0, 0.0, 0.0, 0.0]), np.eye(4)
+        Alignment((240, 320), 0.5, *found, 12, 12, 0.01).save(folder / "alignment.json")
+        return ["--set", f"alignment={folder / 'alignment.json'}"]
+    return []
+
+
 @but(
     *DESIGNS,
     *STUDIES,
@@ -86,9 +99,7 @@ def but(*slow):
     "sts_colours",
 )
 def test_dry_run(path, tmp_path):
-    out, options = tmp_path / "out", []
-    if path.stem == "denoiser":  # photographs that are not shipped
-        options = ["--set", "sources=[{name: drawn, kind: drawn, count: 2}]"]
+    out, options = tmp_path / "out", options_of(path, tmp_path)
     result = call(read_kind(path).command, path, "--out", out, "--dry-run", *options)
     assert result.exit_code == 0, result.output
     *computed, written, end = result.stdout.splitlines()
@@ -129,8 +140,8 @@ class TestExplain:
         assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
 
     @but("design_slm", *STUDIES[:-1])
-    def test_every_file(self, path):
-        result = call("explain", path)
+    def test_every_file(self, path, tmp_path):
+        result = call("explain", path, *options_of(path, tmp_path))
         assert result.exit_code == 0, result.output
         *values, work = result.stdout.splitlines()
         assert f"name: {load_experiment(path, command=None).name}" in values[0]

@@ -319,3 +319,23 @@ def test_encodings():
     deep = Raw(np.array([[0, 13107]], np.uint16))
     np.testing.assert_allclose(as_light(deep)[0, 0, 1], 0.2)
     np.testing.assert_allclose(as_light(deep, "srgb")[0, 0, 1], 0.0331, atol=1e-4)
+
+
+def two_folders(folder, alignment):
+    for name in ("captures", "truths"):
+        (folder / name).mkdir()
+        np.save(folder / name / "a.npy", image(1, channels=1)[..., 0])
+    (folder / "README.md").write_text(f"---\ntruth_alignment: {alignment}\n---\n", "utf-8")
+    return folder
+
+
+def test_a_card_states_what_truths_cover(tmp_path):
+    stated = "{rows: [2, 10], columns: [3, 17], turned: true}"
+    found = open_pairs(two_folders(tmp_path, stated)).alignment
+    assert found == TruthAlignment((2, 10), (3, 17), turned=True, source="README.md")
+
+
+@pytest.mark.parametrize("given", ["[1, 2]", "{rows: [1, 2]}", "{rows: all, columns: [1, 2]}"])
+def test_a_card_that_states_no_place(tmp_path, given):
+    with pytest.raises(MeasurementError, match="truth_alignment is .* give rows: .first, end."):
+        open_pairs(two_folders(tmp_path, given))

@@ -149,9 +149,9 @@ class PsfMethod:
 
     @property
     def averages_tolerance(self) -> float:
-        """What averages over pixels may leave: a quarter of the field's tolerance.
+        """Error that averages over pixels may leave: a quarter of the field's tolerance.
 
-        Nothing where it is 1: that asks for the light of every point, not for a coarse PSF.
+        0 where that is 1, which asks for the light of every point, not for a coarse PSF.
         """
         given = self.field_tolerance or 0.0
         return given / 4 if given < 1 else 0.0

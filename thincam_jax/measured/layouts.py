@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -47,6 +48,7 @@ _KNOWN = (
     "'lensless/' with 'lensed/' or 'measured/' with 'original/', of files with the same names, "
     "which may lie in a folder for each split"
 )
+CARD, TRUTHS = "README.md", "truth_alignment"  # the card, and its key for a `TruthAlignment`
 _SOURCE = "LenslessPiCam dcb4aba, lensless/utils/dataset.py"
 _DIGICAM = TruthAlignment((80, 280), (100, 366), turned=True, source=_SOURCE)
 _MULTILENS = TruthAlignment((118, 241), (220, 343), source=_SOURCE)
@@ -119,7 +121,9 @@ def open_pairs(
     # A folder of a cache is named datasets--OWNER--NAME.
     above = (part.split("--")[-1] for part in reversed(root.resolve().parts))
     known = next((PUBLISHED[name] for name in above if name in PUBLISHED), None)
-    notes = found.notes
+    notes, card = found.notes, _card(root)
+    if known is None and TRUTHS in card:
+        found = dataclasses.replace(found, alignment=_stated(root, card[TRUTHS]))
     if not psfs:
         masks = ", only patterns of masks" if (root / "masks").is_dir() else ""
         notes += (f"no PSF lies beside the captures{masks}: give --psf",)
@@ -130,7 +134,7 @@ def open_pairs(
         encoding="linear" if known is _UPSIDE_DOWN else found.encoding,
         psf_channels="mean" if known is _UPSIDE_DOWN else found.psf_channels,
         bits=bits,
-        licence=_licence(root),
+        licence=_licence(root, card),
         notes=notes,
     )
 
@@ -290,16 +294,35 @@ def _content(path: Path) -> str:
     return f"holds {len(folders)} folders and {len(others)} files ({names})"
 
 
-def _licence(root: Path) -> str:
+def _card(root: Path) -> dict[str, Any]:
+    """Front matter of a data set's card; empty where there is none."""
+    card = root / CARD
+    if not card.is_file():
+        return {}
+    text = read_regular(card).decode("utf-8", "replace")
+    try:
+        said = yaml.safe_load(text.split("---")[1]) if text.startswith("---") else None
+    except (yaml.YAMLError, IndexError):
+        said = None
+    return said if isinstance(said, dict) else {}
+
+
+def _stated(root: Path, given: Any) -> TruthAlignment:
+    """The alignment of truths that a card states; MeasurementError for one that is none."""
+    try:
+        rows, columns = ((int(given[n][0]), int(given[n][1])) for n in ("rows", "columns"))
+        return TruthAlignment(rows, columns, turned=bool(given.get("turned")), source=CARD)
+    except (TypeError, KeyError, ValueError, IndexError, AttributeError):
+        raise MeasurementError(
+            f"{root / CARD}: {TRUTHS} is {shortened(str(given))}; give rows: [first, end], "
+            "columns: [first, end] and turned: true or false"
+        ) from None
+
+
+def _licence(root: Path, card: Mapping[str, Any]) -> str:
     """The licence of a data set's card, or the first line of its LICENSE."""
-    card = root / "README.md"
-    if card.is_file() and (text := read_regular(card).decode("utf-8", "replace")).startswith("---"):
-        try:
-            said = yaml.safe_load(text.split("---")[1])
-        except yaml.YAMLError:
-            said = None
-        if isinstance(said, dict) and said.get("license"):
-            return f"{said['license']} (README.md)"
+    if card.get("license"):
+        return f"{card['license']} ({CARD})"
     for name in ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE"):
         if (root / name).is_file():
             lines = read_regular(root / name).decode("utf-8", "replace").strip().splitlines()

@@ -3,7 +3,9 @@
 import json
 
 import numpy as np
+import PIL.Image
 import pytest
+import scipy
 import yaml
 from commands.test_cli import call, one_line
 from hardware.commands import tiny
@@ -13,7 +15,9 @@ from thincam_jax.commands.study.build import picture
 from thincam_jax.hardware.commands.config import CaptureConfig
 from thincam_jax.hardware.commands.run import build_study, picture_levels
 from thincam_jax.hardware.virtual.optics import MonitorPose, cells_seen
+from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.measured.calibration.alignment import Alignment
+from thincam_jax.measured.layouts import open_pairs
 from thincam_jax.units import deg
 
 MASK = {"betas": ["60 rad/mm^2"], "width": "1.44 mm"}
@@ -73,6 +77,48 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
         assert least < alike <= most
 
 
+@pytest.fixture
+def aligned(tmp_path):
+    """A monitor that stands where the model has it, and a folder of two photographs."""
+    known = np.array([1.0, 0.0, 0.0, 0.0]), 1e-8 * np.eye(4)
+    Alignment((90, 100), 0.5, *known, 9, 9, 0.01).save(tmp_path / "alignment.json")
+    (tmp_path / "photographs").mkdir()
+    for name in ("coins", "chelsea"):
+        photograph = resize(np.atleast_3d(sample_image(name)).mean(axis=-1), (32, 32))
+        PIL.Image.fromarray(np.uint8(255 * photograph)).save(tmp_path / f"photographs/{name}.png")
+    return tmp_path
+
+
+def test_photographs_become_pairs_of_captures_and_truths(aligned):
+    """Each truth, by the PSF of the folder, is the capture to the noise."""
+    file = tiny.write(aligned, yaml.safe_dump(ALIGNMENT))
+    plan = {**PICTURES, "frames": 4, "dark_frames": 2}
+    sets = [f"plan={json.dumps(plan)}", f"alignment={aligned / 'alignment.json'}"]
+    sets += [f"photographs={aligned / 'photographs'}", "licence=own", "camera.exposure=40 ms"]
+    sets += ["virtual.monitor={}", "virtual.display=[90, 100]"]
+    store, out = aligned / "p.zarr", aligned / "out"
+    asked = [part for one in sets for part in ("--set", one)]
+    for args in (("capture", file, "--out", store, *asked), ("run", store, "--out", out)):
+        result = call(*args)
+        assert result.exit_code == 0, result.output
+    assert "2 pairs; next: thincam evaluate" in (out / "report.html").read_text("utf-8")
+    pairs = open_pairs(out / "pairs")
+    assert list(pairs.names) == ["chelsea", "coins"] and pairs.licence == "own (README.md)"
+    (top, bottom), (left, right) = pairs.alignment.rows, pairs.alignment.columns
+    psf = pairs[0].psf.pixels
+    for pair in pairs:
+        assert pair.truth.shape == (1, bottom - top, right - left)
+        seen = np.zeros(psf.shape)
+        seen[top:bottom, left:right] = pair.truth[0]
+        model = scipy.signal.fftconvolve(seen[::-1, ::-1], psf)  # its middle is pixel n // 2
+        rows, columns = (n // 2 for n in psf.shape)
+        model = model[rows : rows + psf.shape[0], columns : columns + psf.shape[1]]
+        design = np.stack([model.ravel(), np.ones(model.size)], axis=1)
+        capture = pair.capture.pixels.ravel()
+        left_over = capture - design @ np.linalg.lstsq(design, capture)[0]
+        assert np.std(left_over) < 0.05 * np.std(capture)
+
+
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
@@ -81,6 +127,7 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
         (["optics=null"], "optics: a plan of kind alignment needs optics"),
         (["alignment=a.json"], "alignment: a plan of kind alignment takes none; drop it"),
         ([f"plan={json.dumps(PICTURES)}"], "alignment: a plan of kind pictures with optics"),
+        (["photographs=nowhere"], "photographs: 'nowhere' holds no photograph; give a folder"),
         (["plan.betas=[60 rad/mm^2, 50 rad/mm^2]"], "plan.betas: a plan of kind alignment has one"),
     ],
 )

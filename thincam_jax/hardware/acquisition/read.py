@@ -1,5 +1,6 @@
 """Reading a complete acquisition: its frames and their records."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
@@ -155,6 +156,17 @@ class Acquisition:
             if offset is not None:
                 found[place] -= offset
         return found
+
+    def means(self) -> Iterator[tuple[Pattern, np.ndarray]]:
+        """Each pattern and the mean of its frames, (y, x) counts minus the mean dark frame."""
+        of_pattern: dict[int, list[int]] = {}
+        for number in self.lit:
+            of_pattern.setdefault(self.plan.steps[number].pattern, []).append(number)
+        dark = self.dark()
+        for pattern, numbers in of_pattern.items():
+            total = sum(self.frame(number).astype(np.float32) for number in numbers)
+            mean = np.asarray(total) / len(numbers)
+            yield self.plan.patterns[pattern], mean if dark is None else mean - dark
 
     def exposed(self) -> list[ExposedFrames]:
         """Frames and dark frames of each exposure; ValueError for fewer than two of either."""

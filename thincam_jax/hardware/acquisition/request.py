@@ -171,7 +171,7 @@ class PlanRequest:
         yield matrix and "methods" not in given, f"{kind} needs them; give one", "methods"
         unused = "methods" in given and not matrix
         yield unused, f"{kind} has 'reconstruction'; drop them", "methods"
-        several = targets > 1 and (aligned or not pictures)
+        several = targets > 1 and not pictures
         yield several, f"{kind} has one; drop the others", "targets"
 
     @property

@@ -1,6 +1,7 @@
 """The command `thincam capture`, and the devices of the files that it takes."""
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -192,13 +193,13 @@ def known_drivers(connected: bool = False, asked: str | None = None) -> list[str
 def build_plan(config: "CaptureConfig") -> "AcquisitionPlan":
     """The plan of a file, with its settings."""
     from thincam_jax.hardware.base import CameraSettings
-    from thincam_jax.hardware.commands.run import picture_levels
     from thincam_jax.hardware.plans import levels_pattern
 
-    settings, shown = config.camera.build(CameraSettings), picture_levels(config)
+    settings, shown = config.camera.build(CameraSettings), config.shown
     given = {"stage_zero": 0.0 if config.optics is None else config.optics.distance, "shown": shown}
     if config.mask is not None:
-        given["mask"] = levels_pattern(*shown.popitem())
+        ((name, levels),) = shown.items()
+        given |= {"shown": {}, "mask": levels_pattern(name, levels)}
     plan = config.plan.build().plan(settings, **given)
     if config.stage is not None:  # it stands where the optics are known
         plan = plan.at_position(0.0)
@@ -213,9 +214,8 @@ def opened(config: "CaptureConfig", plan: "AcquisitionPlan") -> Iterator["Rig"]:
     """
     from thincam_jax.commands.config_file import ConfigError
     from thincam_jax.hardware.acquisition.rig import open_rig
-    from thincam_jax.hardware.commands.run import picture_levels
 
-    pitch, virtual, pictures = config.display.pitch or 0.0, None, picture_levels(config)
+    pitch, virtual, pictures = config.display.pitch or 0.0, None, config.shown
     if config.rig == "virtual":
         virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
@@ -242,7 +242,7 @@ def _shown(render: Callable[["Pattern"], Any], pattern: "Pattern") -> Any:
 def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     """The state and the optics that the virtual devices of a file share."""
     from thincam_jax.hardware.base import CameraSettings
-    from thincam_jax.hardware.commands.run import build_study, picture_levels, screen_system
+    from thincam_jax.hardware.commands.run import build_study, screen_system
     from thincam_jax.hardware.studies.images import mosaic_of
     from thincam_jax.hardware.studies.rig import lensless_system, scenes_of
     from thincam_jax.hardware.virtual.optics import (
@@ -257,7 +257,7 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     virtual, display, optics = config.virtual, config.display, config.optics
     assert virtual is not None  # checked with the file
     if optics is None:
-        before = picture_levels(config).popitem()[1] if config.plan.kind == "scene" else None
+        before = next(iter(config.shown.values())) if config.plan.kind == "scene" else None
         seen = MonitorOptics(screen_system(config), virtual.electrons, before)
     elif config.plan.kind in ("pictures", "alignment"):
         cell = -config.camera.pitch * optics.object.distance / optics.distance  # turned by 180°
@@ -291,7 +291,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
 
     from thincam_jax._core.files import read_json
     from thincam_jax.hardware.acquisition.read import Acquisition
-    from thincam_jax.hardware.commands.run import Taken, picture_levels
+    from thincam_jax.hardware.commands.run import SHOWN_PAIRS, Taken
     from thincam_jax.hardware.displays.levels import measured_levels
     from thincam_jax.hardware.displays.patterns import pattern_levels
     from thincam_jax.hardware.studies.rig import CountingCamera, RigFrames
@@ -303,6 +303,9 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     if kind in ("hadamard", "grey_levels"):
         calibration = HadamardCaptures.load(store) if kind == "hadamard" else measured_levels(found)
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
+    elif config.alignment and len(config.targets) > 1:
+        frames = np.stack([mean for _, mean in itertools.islice(found.means(), SHOWN_PAIRS)])
+        calibration = found
     elif kind == "scene" or config.alignment:
         frames, variance = found.scene()
     else:
@@ -317,7 +320,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
         counts = electron * found.settings[0].exposure * virtual.electrons
         camera = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
     display = found.provenance.get("display_shape") or (virtual and virtual.display) or (768, 1024)
-    given = {"pitch": config.display.pitch, "pictures": picture_levels(config)}
+    given = {"pitch": config.display.pitch, "pictures": config.shown}
     render = partial(pattern_levels, shape=tuple(display), **given)
     seconds, places = store / _SECONDS, [found.shots[step]["position"] for step in found.lit]
     return Taken(

@@ -1,13 +1,17 @@
 """Experiment files of `kind: capture`: the devices of a rig, the plan, and what is seen."""
 
+import functools
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import pydantic
 from pydantic import BeforeValidator, Field
 
 from thincam_jax._core.quantity import FieldError
+from thincam_jax._core.text import slug
 from thincam_jax.commands.kinds import section_of
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.pictures import ScreenMethodConfig, ScreenTargetConfig
@@ -30,6 +34,7 @@ from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model
+from thincam_jax.measured.read import natural_order
 
 if TYPE_CHECKING:
     from thincam_jax.waveguide.commands.config import SeeThroughConfig
@@ -37,6 +42,19 @@ else:
     SeeThroughConfig = section_of("waveguide", "config:SeeThroughConfig")
 
 Count = Annotated[int, Field(ge=1, le=65536)]
+
+
+_PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+
+
+def photograph_files(folder: str) -> list[Path]:
+    """Files of photographs in a folder, in the order of their numbers; ValueError for none."""
+    there = Path(folder).iterdir() if Path(folder).is_dir() else ()
+    files = [one for one in there if one.suffix.lower() in _PHOTOGRAPHS and one.name[0] != "."]
+    if not files:
+        known = ", ".join(_PHOTOGRAPHS)
+        raise ValueError(f"{folder!r} holds no photograph; give a folder of {known}")
+    return sorted(files, key=natural_order)
 
 
 class DeviceConfig(Section):
@@ -152,6 +170,8 @@ class CaptureConfig(ExperimentConfig):
     - `display`: a scene needs none; someone covers the camera for dark frames.
     - `targets`: targets at the object's distance of a virtual rig, or on its screen's cells, one;
       or the pictures of a plan of kind pictures, on its cells.
+    - `photographs`: a folder of image files, which become targets, each named after its file;
+      `licence`: theirs, which a data set of them states.
     - `matrix`: with which such pictures, or a scene, are reconstructed: matrix.zarr of a
       calibration's run, or the store of its captures; by `methods`.
     - `mask`: on a phase modulator, in pixels of the display.
@@ -170,10 +190,25 @@ class CaptureConfig(ExperimentConfig):
     reconstruction: ReconstructionConfig = ReconstructionConfig()
     virtual: VirtualConfig | None = None
     targets: tuple[ScreenTargetConfig, ...] = ()
+    photographs: str | None = None
+    licence: str | None = None
     matrix: str | None = None
     alignment: str | None = None
     methods: tuple[ScreenMethodConfig, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _with_photographs(cls, given: Any):
+        """The file with a target for each photograph: a resolved file names them."""
+        if not isinstance(given, dict) or not (folder := given.get("photographs")):
+            return given
+        try:
+            files = photograph_files(folder)
+        except (ValueError, TypeError) as error:
+            raise FieldError(str(error), "photographs") from None
+        found = [{"name": slug(one.stem), "kind": "file", "path": str(one)} for one in files]
+        return {**given, "targets": [*given.get("targets", ()), *found], "photographs": None}
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
@@ -215,6 +250,13 @@ class CaptureConfig(ExperimentConfig):
                 yield other, fault, *place, "object", "cells"
                 fault = f"virtual.sensor is {virtual.sensor}; give this"
                 yield screen.sensor.shape != virtual.sensor, fault, *place, "sensor", "shape"
+
+    @functools.cached_property
+    def shown(self) -> dict[str, np.ndarray]:
+        """Levels of its pictures by name, see `picture_levels`, read once."""
+        from thincam_jax.hardware.commands.run import picture_levels
+
+        return picture_levels(self)
 
     @property
     def cells(self) -> tuple[int, int] | None:

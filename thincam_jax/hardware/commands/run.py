@@ -20,6 +20,7 @@ from thincam_jax.commands.study.build import build_optics, picture
 from thincam_jax.hardware import plot
 from thincam_jax.hardware.commands.config import CaptureConfig
 from thincam_jax.hardware.studies.images import frame_solver
+from thincam_jax.hardware.studies.pairs import object_grid, truth, write_pairs
 from thincam_jax.hardware.studies.registration import (
     ShotPlace,
     ShotPlaces,
@@ -38,11 +39,13 @@ from thincam_jax.hardware.studies.rig import (
     recover_to,
 )
 from thincam_jax.imaging.encoding import as_picture
+from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.measured import write_image
 from thincam_jax.measured.calibration.alignment import Alignment
 from thincam_jax.plot.pictures import draw_columns
+from thincam_jax.studies.evaluate import rounded
 from thincam_jax.studies.pictures import PUBLISHED, beside, finding
 from thincam_jax.studies.study import Method, Study, Synthesis, Target
 
@@ -50,6 +53,7 @@ _MATRIX = (
     "The matrix is in matrix.zarr, to be given as `matrix` of a file that captures pictures or a "
     "scene; in Python it is read by `thincam_jax.measured.calibration.read_matrix`."
 )
+SHOWN_PAIRS = 2  # pictures of a data set that a page shows
 _PLACES = (
     "Distance of mask and sensor, and the mask's middle beside the sensor's, by the images of the "
     "single shots. The first shot is taken to stand where it reads."
@@ -63,7 +67,8 @@ class Taken:
     - `seen`: frames, some only of a Hadamard plan; its camera is that of a virtual rig.
     - `labels`: words for what was shown for each. `seconds`: duration of the acquisition's steps,
       by name.
-    - `exposures`: s. `calibration`: HadamardCaptures or GreyLevels, of such plans.
+    - `exposures`: s. `calibration`: HadamardCaptures or GreyLevels, of such plans; the Acquisition
+      of several pictures on an aligned monitor.
     """
 
     seen: RigFrames
@@ -108,6 +113,8 @@ class _CaptureRun(Run):
             self.add("system matrix" if kind == "hadamard" else kind.replace("_", " "), steps[kind])
         elif config.matrix is not None:
             self.add("images", self.look)
+        elif config.alignment and len(config.targets) > 1:
+            self.add("pairs", self.pair_up)
         elif config.plan.kind != "psf_stack" and config.optics is not None:
             self.add("image", self.reconstruct)
         self.add("report", self.report)
@@ -190,6 +197,25 @@ class _CaptureRun(Run):
         self.metrics["status"] = captured.status
         self.metrics["object_pixel_mm"] = pitch
 
+    def pair_up(self) -> None:
+        """All pictures and their captures as a data set, and images of the first ones."""
+        frames, config, folder = self.taken.seen.frames, self.config, self.folder.path / "pairs"
+        study = self.study((frames.shape[1], frames.shape[2]))
+        width = study.config.object.width
+        found = write_pairs(
+            folder, study, self.taken.calibration, width, config.licence or "not stated"
+        )
+        solve, images, scores = frame_solver(study, width), {}, {}
+        solved = [as_picture(np.asarray(solve(frame[None]).image)) for frame in frames]
+        grid = object_grid(study, (solved[0].shape[0], solved[0].shape[1]))
+        for target, image in zip(study.targets, solved, strict=False):
+            light, seen = truth(target, grid), f"{target.name}, seen"
+            images |= {target.name: light, seen: image}
+            scores[seen] = rounded(psnr(image, light))
+        self.folder.save_figure("images", plot.draw_images(images, float(grid.pitch), scores))
+        self.metrics |= {"pairs": found, "psnr_db": scores}
+        self.found = f"{len(study.targets)} pairs; next: thincam evaluate {folder}"
+
     def study(self, shape: tuple[int, int]) -> Study:
         """The study of frames of a shape, its shots where the stage read.
 
@@ -216,7 +242,7 @@ class _CaptureRun(Run):
         try:
             known = calibrated(Path(config.matrix or ""), self.folder.path)
             solvers = {method.name: method.build() for method in config.methods}
-            shown = {name: levels / 255 for name, levels in picture_levels(config).items()}
+            shown = {name: levels / 255 for name, levels in config.shown.items()}
             asked = shown or {"scene": None}
             found = reconstruct_pictures(asked, seen.frames, known, solvers, seen.variance)
         except ValueError as error:
@@ -298,7 +324,7 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     if display.phase_levels is None:
         built = build_optics(mask, sensor, methods[0].exposures[0])
     else:
-        (levels,) = picture_levels(config).values()
+        (levels,) = config.shown.values()
         seen = display.pitch, optics.wavelength, display.fill_factor
         built = display.phase_levels.build().mask(levels, *seen), sensor.build()
     return Study(
@@ -329,13 +355,26 @@ def picture_levels(config: CaptureConfig) -> dict[str, np.ndarray]:
     if config.cells is None or not (config.matrix or config.alignment):
         return {}
 
+    known = None if config.alignment is None else _alignment(config)
+
     def levels(one: PictureConfig) -> tuple[str, np.ndarray]:
         found = np.rint(255 * picture(one, config.cells)).astype(np.uint8)
-        if config.alignment and config.optics:
-            found = Alignment.load(config.alignment).place(found, config.optics.object.width)
+        if known is not None and config.optics is not None:
+            found = known.place(found, config.optics.object.width)
         return one.name, found
 
     return dict(config.read_all("targets", levels, "path"))
+
+
+def _alignment(config: CaptureConfig) -> Alignment:
+    """The place of the display. **Errors**: ConfigError, one line, where there is none."""
+    try:
+        return Alignment.load(config.alignment or "")
+    except OSError as error:
+        fault = f"{config.alignment}: {error.strerror}; capture and run a plan of kind alignment"
+    except ValueError as error:
+        fault = str(error)
+    raise ConfigError(f"{config.place_of('alignment')}alignment: {fault}")
 
 
 def screen_system(config: CaptureConfig) -> Sparse:
