@@ -115,6 +115,26 @@ frames += frames[-2:0:-1]
 frames[0].save(FIGURES / "sweep.gif", save_all=True, append_images=frames[1:], duration=140, loop=0)
 
 # %%
+# A map of distances
+# ------------------
+#
+# Each pixel may have a focus of its own: left near and right far, and the other way round. The
+# control code of thesis Fig 4.8 had such halves and was obeyed by neither.
+
+near, far = distances[3], distances[-4]
+left = np.arange(shape[1]) < shape[1] // 2  # of the upright image
+figure, axes = plt.subplots(1, 4, figsize=(11, 3.2), layout="constrained")
+for pair, first, second in ((axes[:2], near, far), (axes[2:], far, near)):
+    wanted = np.where(left, first, second) * np.ones(shape)
+    found = network.focus(scenes.capture[0], wanted[:, ::-1], scenes.deviation[0])[::-1, ::-1]
+    lens = np.where(left, *(truths[0][list(distances).index(t)] for t in (first, second)))
+    for ax, image, name in zip(pair, (lens, found), ("lenses", "network"), strict=True):
+        ax.imshow(image, cmap="gray", vmin=0, vmax=white)
+        ax.set_title(f"{name}: {first:.0f} | {second:.0f} mm", fontsize=10)
+        ax.set_axis_off()
+figure.savefig(FIGURES / "map.png", dpi=110)
+
+# %%
 # Trained distances are not special: PSNR against a lens of the mask's width, focused there, varies
 # without jumps. The untrained network is the linear start alone.
 

@@ -113,7 +113,7 @@ def test_what_it_cannot_do_is_told_in_a_line():
     with pytest.raises(ValueError, match="distance = 49 mm lies outside"):
         network.focus(recording().captures[0], 49.0, 0.01)
     capture, map_ = recording().captures[0], np.full((32, 32), 80.0)
-    with pytest.raises(ValueError, match=r"shape \(32, 32\); a lens has one focus: give one"):
+    with pytest.raises(ValueError, match=r"shape \(32, 32\); give one .* map .*pixels, \(14, 12\)"):
         network.focus(capture, map_, 0.01)
     with pytest.raises(ValueError, match=r"shape \(32, 32\); give a list of them, such as"):
         network.sweep(capture, map_, 0.01)
@@ -127,6 +127,24 @@ def test_what_it_cannot_do_is_told_in_a_line():
     with pytest.raises(ValueError, match=r"give a recording by tc\.Cameras"):
         psfs = tc.Psfs(np.ones((1, 5, 5)))
         tc.reconstruct(tc.Recording(np.ones((1, 16, 18)), psfs), Learned(network))
+
+
+def test_each_part_of_an_image_is_focused_on_its_own_distance():
+    """Thesis Fig 4.8, where a control code with two halves is obeyed by neither."""
+    network, captures = tiny.network(), jnp.stack([recording().captures[0]] * 2)
+    shape = network.camera.field_shape
+    near, far = (network.focus(captures, t, 0.01) for t in (60.0, 150.0))
+    halves = np.where(np.arange(shape[1]) < 4, 60.0, 150.0) * np.ones(shape)
+    found = network.focus(captures, halves, 0.01)
+    np.testing.assert_allclose(found, np.where(halves == 60.0, near, far), rtol=1e-5)
+    slope = np.linspace(60.0, 150.0, shape[0] * shape[1]).reshape(shape)
+    found = np.asarray(network.focus(captures[0], slope, 0.01))
+    for at in ((0, 0), (3, 5), (shape[0] - 1, shape[1] - 1)):
+        alone = np.asarray(network.focus(captures[0], slope[at], 0.01))
+        scale = np.abs(alone).max()
+        assert abs(found[at] - alone[at]) < 1e-2 * scale
+    with pytest.raises(TypeError, match="map of distances needs known numbers"):
+        jax.jit(lambda t: network.focus(captures, t, 0.01))(halves)
 
 
 def test_what_does_not_explain_its_capture_is_doubted():

@@ -10,6 +10,7 @@ last one says the rest, too: what a lens focused there sees beside what is rende
 the image in which all is sharp, and where each pixel stands.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,8 +20,10 @@ from typing import Annotated, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
@@ -40,6 +43,8 @@ from thincam_jax.learn.refocusing.scenes import lens_blur
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras
+
+_BLUR = 0.5  # pixels by which a lens blurs more from one image of a map of distances to the next
 
 
 @checked
@@ -231,14 +236,38 @@ class RefocusNetwork(eqx.Module):
     ) -> Float[Array, "*batch y x"]:
         """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them.
 
-        **Errors**: ValueError for a distance out of range, and for a map of distances.
+        - `distance`: one for all; or a map (y, x) of the image's pixels, each as a lens focused on
+          its own distance would see it. `distance` gives such maps, in the same orientation.
+
+        **Errors**: ValueError for a distance out of range, and for a map of another shape;
+        TypeError for a traced map.
         """
-        if (shape := jnp.asarray(distance).shape)[1:]:
+        if not (shape := jnp.asarray(distance).shape)[1:]:
+            return _batched("image", self, captures, noise_std, self.camera.within(distance))
+        if shape != self.camera.field_shape:
             raise ValueError(
-                f"distance has shape {shape}; a lens has one focus: give one distance "
-                "in mm, several to sweep, or take all_in_focus for an image sharp everywhere"
+                f"distance has shape {shape}; give one distance in mm, several to sweep, or a map "
+                f"of the image's pixels, {self.camera.field_shape}"
             )
-        return _batched("image", self, captures, noise_std, self.camera.within(distance))
+        if checks.is_traced(distance):
+            raise TypeError("a map of distances needs known numbers: call it outside of jit")
+        inverse = 1 / np.asarray(self.camera.within(distance), float)
+        levels = self._levels(inverse)
+        images = self.sweep(captures, 1 / levels, noise_std)
+        place = np.interp(inverse, levels, np.arange(len(levels)))
+        shares = np.clip(1 - np.abs(place - np.arange(len(levels))[:, None, None]), 0, None)
+        shares = jnp.asarray(shares, images.dtype)
+        return jnp.einsum("lyx,l...yx->...yx", shares, images, precision="highest")
+
+    def _levels(self, inverse: Float[np.ndarray, "y x"]) -> Float[np.ndarray, " level"]:
+        """1/t, ascending, between which images of a map are interpolated: all, or a close ladder.
+
+        From step to step of the ladder a lens blurs by less than half a pixel more.
+        """
+        levels = np.unique(inverse)
+        blur = float(self.camera.defocus_radius(levels[-1] - levels[0]))
+        steps = math.ceil(blur / _BLUR) + 1
+        return levels if len(levels) <= steps else np.linspace(levels[0], levels[-1], steps)
 
     def sweep(
         self, captures: Numbers, distances: Numbers | Sequence[Number], noise_std: Numbers
