@@ -17,6 +17,7 @@ from thincam_jax.hardware.studies.registration import (
 )
 from thincam_jax.hardware.virtual.optics import ModulatorOptics, StageErrors
 from thincam_jax.imaging.metrics import align, psnr
+from thincam_jax.measured.bayer import mosaic
 from thincam_jax.studies.evaluate import noise_free
 from thincam_jax.studies.study import Method, Study, Target
 from thincam_jax.units import nm, um
@@ -149,3 +150,25 @@ def test_a_virtual_sensor_that_stands_aside_sees_the_frame_shifted():
     shown = np.random.default_rng(2).integers(0, 2, (16, 20)).astype(np.uint8) * 255
     first, second = (np.asarray(one(shown, 0.3)) for one in (still, moved))
     np.testing.assert_allclose(second[:-2, 1:], first[2:, :-1], rtol=2e-4)
+
+
+@pytest.mark.thorough
+def test_shots_of_a_mosaic_of_colours_are_found():
+    """Each colour has its own light; the mean of their images is registered."""
+    grey, methods = study(), []
+    for number, light in enumerate((630 * nm, 532 * nm, 465 * nm)):
+        scanned = tc.Exposures(40.0, [6.0, 6.6], wavelength=light, width=1.6).fringe_scanned()
+        methods.append(Method(f"{number}", scanned, tc.Wiener(), "fringe_scanning"))
+    plane = grey.targets[0].plane
+    nominal = replace(grey, methods=tuple(methods))
+    moved = standing_at(nominal, ShotPlaces((FIRST, MOVED)))
+    colours = [
+        [np.asarray(noise_free(moved, e, plane))[0] for e in method.exposures]
+        for method in moved.methods
+    ]
+    frames = mosaic(np.stack(colours, axis=1), "RGGB")
+    frames = frames + 1e-3 * frames.mean() * np.random.default_rng(0).normal(size=frames.shape)
+    found = register_shots(nominal, frames.astype(np.float32), WIDTH, "RGGB").shots[1]
+    assert found.status == "moved"
+    assert abs(found.distance - 6.6 - ALONG) < 3 * found.distance_error + 2e-3
+    np.testing.assert_allclose(found.centre, CENTRE, atol=3 * found.centre_error + 1e-3)
