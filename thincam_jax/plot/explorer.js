@@ -13,8 +13,8 @@ const STYLE = `
 .tc-pictures canvas { background: #fff; }
 .tc-pictures figcaption { font-size: 13px; margin-top: .2rem; }
 .tc-pictures img:not([src]) { visibility: hidden; }
-.tc-empty { position: relative; outline: 1px solid #999; }
-.tc-empty::before { content: attr(data-wait); position: absolute; inset: 45% 0 auto; text-align: center; }
+.tc-empty { position: relative; }
+.tc-empty::before { content: attr(data-wait); position: absolute; inset: 0 0 auto; aspect-ratio: 1; display: grid; place-items: center; outline: 1px solid #999; }
 .tc-empty canvas { visibility: hidden; }
 .tc-stale { opacity: .45; }
 .tc-lines { margin: .8rem 0 0; min-height: 2.8em; }`;
