@@ -93,11 +93,14 @@ def test_it_counts_and_goes(at_terminal):
         time.sleep(0.1)
         tell(4, 10)
         time.sleep(0.1)
+        tell(5, 10, "half of it is known")
+        time.sleep(0.1)
     lines = [line.rstrip() for line in at_terminal.getvalue().split("\r") if line.strip()]
     lines = [re.sub(r"\d+ s", "… s", line) for line in lines]
     assert lines[0] == "looking, … s: compiling, if this is the first of its size"
     assert "looking, … s: step 2 of at most 10" in lines
-    assert lines[-1] == "looking, … s: step 4 of at most 10, at most … s left"
+    assert "looking, … s: step 4 of at most 10, at most … s left" in lines
+    assert lines[-1] == "looking, … s: half of it is known"
     shown = at_terminal.getvalue()
     assert shown.endswith("\r") and not shown.split("\r")[-2].strip()  # the line is gone
 

@@ -1,6 +1,8 @@
 """Free numbers of a design within their limits, and the design for an own sensor."""
 
+import logging
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 from design.setting import thesis_design
 
 import thincam_jax as tc
+from thincam_jax._core import progress
 from thincam_jax.design import DesignSpace, Variable, shots
 from thincam_jax.design.design import Design
 from thincam_jax.design.landscape import evaluate_grid
@@ -147,8 +150,14 @@ def test_distances_that_cross_are_refused(given):
 
 
 @pytest.mark.thorough
-def test_no_worse_than_an_exhaustive_grid():
-    found = tc.design.for_sensor(tc.Sensor((60, 80), 40 * um), distance=(3.0, 6.0))
+def test_no_worse_than_an_exhaustive_grid(monkeypatch, caplog):
+    """With the best so far on the line of progress while it goes on."""
+    monkeypatch.delenv("THINCAM_PROGRESS", raising=False)
+    monkeypatch.setattr(progress, "_SELDOM", 0.05)
+    with caplog.at_level(logging.INFO):
+        found = tc.design.for_sensor(tc.Sensor((60, 80), 40 * um), distance=(3.0, 6.0))
+    told = re.findall(r"error (\S+) dB so far, β of shot 1 \S+ rad/mm², .* mm$", caplog.text, re.M)
+    assert told and found.errors_db[0] <= min(map(float, told)) + 0.05
     problem, best = found.problem, found.best
     with jax.enable_x64(True):
         points, costs = evaluate_grid(problem.objective, problem.space, problem.data, 17)

@@ -18,16 +18,17 @@ _is_watched = contextvars.ContextVar("is_watched", default=False)
 
 
 @contextlib.contextmanager
-def watched(what: str) -> Iterator[Callable[[int, int], None]]:
+def watched(what: str) -> Iterator[Callable[..., None]]:
     """Show `what` goes on while it does; also a decorator.
 
-    Yields a function of the step done and the most that there can be. Nothing is shown of what
-    takes less than a second, or within another watched call. At a terminal the line is written to
+    Yields a function of the step done and the most that there can be, and of what is known so far,
+    which is shown in their place. Nothing is shown of what takes less than a second, or within
+    another watched call. At a terminal the line is written to
     stderr, in a notebook below its cell, and goes at the end; elsewhere it is logged every ten
     seconds, as information. THINCAM_PROGRESS=off in the environment ends it.
     """
     if _is_watched.get() or os.environ.get("THINCAM_PROGRESS") == "off":
-        yield lambda step, most: None
+        yield lambda step, most, said="": None
         return
     line, token = _Line(what), _is_watched.set(True)
     try:
@@ -63,13 +64,13 @@ class _Line:
     def __init__(self, what: str):
         self.what, self.began = what, time.monotonic()
         self.first: tuple[int, float] | None = None
-        self.now = (0, 0)
+        self.now, self.said = (0, 0), ""
         self.stream, self.width = sys.stderr, 0
         self.output = _notebook_output()
         self.is_live = self.stream.isatty() or self.output is not None
 
-    def tell(self, step: int, most: int) -> None:
-        self.now = (step, most)
+    def tell(self, step: int, most: int, said: str = "") -> None:
+        self.now, self.said = (step, most), said
         self.first = self.first or (step, time.monotonic())
 
     def say(self) -> float:
@@ -96,6 +97,8 @@ class _Line:
 
     def __str__(self) -> str:
         spent = f"{self.what}, {time.monotonic() - self.began:.0f} s"
+        if self.said:
+            return f"{spent}: {self.said}"
         if self.first is None:
             return f"{spent}: {_FIRST}"
         (start, since), (step, most) = self.first, self.now

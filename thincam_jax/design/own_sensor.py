@@ -1,6 +1,7 @@
 """Design for an own sensor: two pitches and a distance, in seconds for any number of pixels."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -75,7 +76,6 @@ def beta_bounds(pitch: float, width: float) -> tuple[float, float]:
 
 
 @checked
-@watched("designing")
 def for_sensor(
     sensor: Sensor,
     *,
@@ -121,7 +121,7 @@ def for_sensor(
     given = sensor.pitch, object_distance, object_width, wavelength
     pitch, far, across, light = (float(decimal_value(length)) for length in given)
     width = min(sensor.shape) * pitch
-    with allow("float64"):
+    with watched("designing") as tell, allow("float64"):
         setup = Setup(pitch, width, far, across, noise=noise, prior=PowerLaw(2.8))
         setup = cast(setup, "float64")
         start = min(max(_DISTANCE, nearest), farthest)
@@ -139,18 +139,20 @@ def for_sensor(
             design_problem(BayesError(), space, setup, phase_pairs(2), FrequencyCounts(exact=n))
             for n in (_COARSE, _FINE)
         )
-        return _searched(replace(fine, data=coarse.exact))
+        return _searched(replace(fine, data=coarse.exact), tell)
 
 
-def _searched(problem: DesignProblem) -> SensorDesign:
+def _searched(problem: DesignProblem, tell: Callable[..., None]) -> SensorDesign:
     space, key = problem.space, jax.random.key(0)
     given = problem.objective, space, problem.data
     points, costs = map(np.asarray, sampled(*given, _SAMPLES, key))
+    tell(0, 0, _so_far(space, points, costs))
     near = points[np.argsort(costs)[:_BEST]]
     low, high = near.min(axis=0), near.max(axis=0)
     finer = low + (high - low) * points
     every = np.concatenate([points, finer])
     known = np.concatenate([costs, evaluate(*given, jnp.asarray(finer))])
+    tell(0, 0, _so_far(space, every, known))
     starts = every[best_apart(every, known, _STARTS)]
     better, more = improved(problem, starts[::-1], ["iterations_exhausted"] * (_STARTS - 1))
     best, count = min(better, key=lambda one: one.objective), len(every) + more
@@ -159,6 +161,17 @@ def _searched(problem: DesignProblem) -> SensorDesign:
     errors = _errors_db(problem, np.stack([best.point, *beside]))
     ends = tuple(_plateau(problem, best, n, errors[0] + PLATEAU_DB) for n in range(space.size))
     return SensorDesign(problem, best, random, tuple(errors.tolist()), ends, count)
+
+
+def _so_far(space: DesignSpace, points: np.ndarray, costs: np.ndarray) -> str:
+    """The best of some points, in words."""
+    best = int(np.argmin(costs))
+    numbers = space.numbers(space.design(jnp.asarray(points[best])))
+    pairs = [
+        "{0} {2:.3g} {1}".format(*label.rsplit(", ", 1), float(value))
+        for label, value in zip(space.labels, numbers, strict=True)
+    ]
+    return f"error {10 * math.log10(costs[best]):.2f} dB so far, {', '.join(pairs)}"
 
 
 def _errors_db(problem: DesignProblem, points: np.ndarray) -> np.ndarray:
