@@ -122,6 +122,10 @@ def test_smooth_misfit_does_not_end_the_iterations_at_the_coarse_image():
     result = tc.reconstruct(recording, tc.AdmmTV())
     first, *objectives = [p.objective for p in result.history]
     assert result.status == "converged" and max(objectives) > first
-    assert min(objectives) < 0.99 * first
+    # The coarse image's is 0.7 % above the lowest, which a long run from any image finds.
+    grey = jnp.full(result.image.shape, 0.5)
+    exact = tc.reconstruct(recording, tc.AdmmTV(iterations=400, tolerance=1e-7), start=grey)
+    lowest = min(p.objective for p in exact.history)
+    assert first > 1.005 * lowest and min(objectives) < 1.001 * lowest
     short = tc.reconstruct(recording, tc.AdmmTV(iterations=20))  # it rises at the last one
     assert short.status == "iterations_exhausted" and short.iterations == 20

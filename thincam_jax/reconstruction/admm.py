@@ -261,7 +261,7 @@ class AdmmMethod(OptimistixMethod):
 
     def advance(self, state: SolverState, count: int):
         if not self.judged:
-            return super().advance(state, count)
+            return self.advance_unjudged(state, count)
         state = super().advance(state, count - 1)
         before = jax.device_put(state.value, may_alias=False)  # the last step reuses its memory
         state = super().advance(state, 1)
@@ -269,6 +269,9 @@ class AdmmMethod(OptimistixMethod):
         relaxation = self.solver.relaxation.astype(before.image.dtype)
         judged = _judged(self.arguments.penalties, (before, state.value), settled, relaxation)
         return SolverState(state.value, judged)
+
+    def advance_unjudged(self, state: SolverState, count: int):
+        return super().advance(state, count)
 
     def residuals(self, state: SolverState):
         return super().residuals(state) if self.judged else Residuals(math.nan, math.nan)

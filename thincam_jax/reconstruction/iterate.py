@@ -80,6 +80,10 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
     def advance(self, state: Method_State, count: int) -> Method_State:
         """The state after `count` more iterations; the state given must not be used again."""
 
+    def advance_unjudged(self, state: Method_State, count: int) -> Method_State:
+        """The state after as many more, by some methods without residuals to ask for."""
+        return self.advance(state, count)
+
     @abc.abstractmethod
     def image(self, state: Method_State) -> Image:
         """The image of a state."""
@@ -172,6 +176,7 @@ class Schedule:
       objective by less than half of that.
     - `rising`: a run ends, not converged, if from its second check on the objective is above the
       lowest one by more than this share.
+    - `judged`: whether residuals are looked at after `adapt_until` as well.
     """
 
     iterations: int
@@ -182,6 +187,7 @@ class Schedule:
     settled: float = 0.0
     still: float = 0.0
     rising: float = 0.0
+    judged: bool = True
 
 
 def iterate(
@@ -212,9 +218,11 @@ def iterate(
         state = method.start(image)
         while done < schedule.iterations:
             count = min(schedule.check_every, schedule.iterations - done)
-            state = method.advance(state, count)
+            is_judged = schedule.judged or done < schedule.adapt_until
+            state = (method.advance if is_judged else method.advance_unjudged)(state, count)
             done += count
-            residuals, current = method.residuals(state), method.image(state)
+            residuals = method.residuals(state) if is_judged else Residuals(math.nan, math.nan)
+            current = method.image(state)
             progress = Progress(done, judged(current), residuals.primal, residuals.dual)
             if not math.isfinite(progress.objective):
                 status = "non_finite"

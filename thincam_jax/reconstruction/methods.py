@@ -21,6 +21,7 @@ from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.reconstruction.assembly import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.coarse import coarsened, finer
+from thincam_jax.reconstruction.cut_psf import with_cut_psfs
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
@@ -354,7 +355,7 @@ class AdmmTV(AbstractRegularised):
 
     def _by_levels(self, problem, image, callback) -> Outcome:
         """Outcome by way of larger pixels, if there are enough."""
-        coarse, small, size = coarsened(problem, image, _COARSER)
+        coarse, small, size = coarsened(with_cut_psfs(problem, image), image, _COARSER)
         if size == 1:
             return self._from_nothing(problem, image, callback)
         first = self._rough._from_nothing(coarse, small, None, rough=True)
@@ -364,7 +365,7 @@ class AdmmTV(AbstractRegularised):
         # Penalties are those of the image, and stay: unless they lead away, as from smooth misfit.
         still = _STILL * self.tolerance
         schedule = Schedule(self.iterations, self.tolerance, still=still, rising=_RISEN)
-        method = in_parallel(problem, admm_method, image)
+        method = in_parallel(with_cut_psfs(problem, image), admm_method, image)
         second = iterate(method, image, schedule, callback=callback)
         if second.status == "iterations_exhausted" and second.iterations < self.iterations:
             third = self._by_admm(problem, second.image, callback, second.iterations)
@@ -398,7 +399,9 @@ class AdmmTV(AbstractRegularised):
         limits = self.iterations, self.tolerance
         # About its minimum the objective changes by the square of the image's change.
         settled = 10 * self.tolerance * min(1.0, self.tolerance / _FINE)
-        schedule = Schedule(*limits, adapt_until=until, done=done, settled=settled)
+        # Of a start only the objective tells its end: residuals take a third of small iterations.
+        ends = {"settled": settled, "judged": not rough}
+        schedule = Schedule(*limits, adapt_until=until, done=done, **ends)
         method = in_parallel(problem, functools.partial(admm_method, rough=rough))
         return iterate(method, image, schedule, callback=callback)
 

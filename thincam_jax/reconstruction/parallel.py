@@ -48,6 +48,9 @@ class ParallelMethod(AbstractMethod[tuple[Any, ...]]):
     def advance(self, state: tuple[Any, ...], count: int):
         return tuple(_in_threads(lambda m, s: m.advance(s, count), self.methods, state))
 
+    def advance_unjudged(self, state: tuple[Any, ...], count: int):
+        return tuple(_in_threads(lambda m, s: m.advance_unjudged(s, count), self.methods, state))
+
     def image(self, state: tuple[Any, ...]):
         images = _in_threads(lambda m, s: np.asarray(m.image(s)), self.methods, state)
         return checks.as_array(np.stack(images).reshape(self.shape))
