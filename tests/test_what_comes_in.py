@@ -9,6 +9,8 @@ import warnings
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import PIL.Image
 import pytest
@@ -112,16 +114,44 @@ def test_a_raw_file_says_pattern_and_levels(tmp_path, image_of):
             image_of(*files, *wrong)
 
 
-def test_numbers_in_place_of_leaves():
-    """`eqx.tree_at` puts a Python number where a camera holds an array."""
+NUMBERS = {
+    "whole": 26,
+    "float": 26.0,
+    "half": np.float16(26),
+    "byte": np.int8(26),
+    "word": np.uint16(26),
+    "long": np.longdouble(26),
+    "swapped": np.asarray(26, ">f8"),
+    "half of JAX": jnp.float16(26),
+    "bfloat16": jnp.bfloat16(26),
+    "word of JAX": jnp.int16(26),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_in_place_of_leaves(name):
+    """`eqx.tree_at` puts a number of any type where a camera holds an array."""
     mask = tc.FresnelZoneAperture(beta=20.0, width=3.0)
     camera, same = (
         tc.LenslessCamera(m, tc.Sensor((36, 48), 80 * um), 4.0)
         for m in (mask, tc.FresnelZoneAperture(beta=26.0, width=3.0))
     )
-    changed = eqx.tree_at(lambda c: c.mask.beta, camera, 26.0)
+    changed = eqx.tree_at(lambda c: c.mask.beta, camera, NUMBERS[name])
     light: Any = {"wavelength": 550 * nm, "object_distance": 200.0}
-    np.testing.assert_allclose(tc.psf(changed, **light), tc.psf(same, **light))
+    with jax.numpy_dtype_promotion("standard"):  # halves become single precision
+        found = tc.psf(changed, **light)
+    np.testing.assert_allclose(found, tc.psf(same, **light), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [True, np.bool_(True), "26", 26j, np.float16(-26)], ids=repr)
+def test_no_numbers_in_place_of_leaves(wrong):
+    """What its constructor refuses is refused in the same words."""
+    camera = tc.LenslessCamera(
+        tc.FresnelZoneAperture(20.0, width=3.0), tc.Sensor((36, 48), 80 * um), 4.0
+    )
+    changed = eqx.tree_at(lambda c: c.mask.beta, camera, wrong)
+    with pytest.raises((TypeError, ValueError), match="beta = .*rad/mm"):
+        tc.psf(changed, wavelength=550 * nm, object_distance=200.0)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])

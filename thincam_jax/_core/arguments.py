@@ -32,6 +32,8 @@ class _Kind:
 
 _Kinds = tuple[_Kind, ...]
 
+_SHORT = ("float16", "bfloat16", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16)))
+
 
 def any_rank(function: _Public) -> _Public:
     """The function, where JAX's option `jax_numpy_rank_promotion` is for other arrays alone."""
@@ -100,7 +102,7 @@ def refuse_unsound(names: Iterable[str], args: tuple[Any, ...], kwargs: dict[str
 
 
 def _settled(value: Any) -> Any:
-    """Modules, alone or in lists, with the plain numbers that `equinox.tree_at` put in.
+    """Modules, alone or in lists, with the numbers of any type that `equinox.tree_at` put in.
 
     They become arrays, and are checked, as when the module is made.
     """
@@ -109,12 +111,13 @@ def _settled(value: Any) -> Any:
         return value if all(map(operator.is_, parts, value)) else type(value)(parts)
     if not isinstance(value, eqx.Module):
         return value
-    if not any(type(leaf) in (int, float) for leaf in jax.tree.leaves(value)):
+    if not any(map(_is_plain, jax.tree.leaves(value))):
         return value
     fields = {field.name: field.metadata for field in dataclasses.fields(value)}
     parts = {}
     for name, one in vars(value).items():
-        convert = fields[name].get("converter") if type(one) in (int, float) else None
+        is_plain = not fields[name].get("static") and _is_plain(one)
+        convert = fields[name].get("converter") if is_plain else None
         parts[name] = convert(one) if isinstance(convert, Quantity) else _settled(one)
     if all(one is vars(value)[name] for name, one in parts.items()):
         return value
@@ -122,6 +125,15 @@ def _settled(value: Any) -> Any:
     for name, one in parts.items():
         object.__setattr__(made, name, one)
     return made
+
+
+def _is_plain(leaf: Any) -> bool:
+    """Whether a converter of numbers would change its type: Python's, whole, half or swapped."""
+    if isinstance(leaf, jax.Array):
+        return not checks.is_traced(leaf) and leaf.dtype in _SHORT
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.dtype.char not in "fdFD" or not leaf.dtype.isnative
+    return isinstance(leaf, int | float | complex | str)
 
 
 def _words(kinds: _Kinds) -> str:

@@ -164,18 +164,21 @@ def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Ch
 def as_array(value: Any, *, floating: bool = False) -> Array:
     """A value for JAX in its own precision; `floating`: whole numbers become floating ones.
 
+    Half precision becomes single, as FFTs and complex numbers have no less.
+
     `jnp.asarray` would compile a program for each shape of a NumPy array, and give a plain number a
     weak type, for which programs are compiled once more.
     """
-    if isinstance(value, jax.Array):
-        if not value.weak_type and not (floating and value.dtype.kind in "iub"):
+    is_half = isinstance(value, jax.Array) and value.dtype in (jnp.float16, jnp.bfloat16)
+    if isinstance(value, jax.Array) and (not is_half or is_traced(value)):
+        if not is_half and not value.weak_type and not (floating and value.dtype.kind in "iub"):
             return value
     elif not holds_traced(value):
         known = native(value)
         if floating and known.dtype.kind in "iub":
             known = known.astype(float)
         return jax.device_put(known, may_alias=False)
-    array = jnp.asarray(value)
+    array = jnp.asarray(value, jnp.float32 if is_half else None)
     if floating and array.dtype.kind in "iub":
         array = array.astype(float)
     return jax.lax.convert_element_type(array, array.dtype)
