@@ -63,6 +63,28 @@ def test_the_only_array_or_that_of_a_key(tmp_path, name):
         read_image(f"{path}:psf")
 
 
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_image_beside_numbers_or_with_an_axis_of_one(tmp_path, name):
+    path = tmp_path / name
+    WRITERS[name](path, CAPTURE=COUNTS[None], TIME=np.full((1,) * 2, 0.02))
+    key = ":CAPTURE" if name in ("a.npz", "a.h5", "v73.mat", "a.fits") else ""
+    np.testing.assert_array_equal(read_image(f"{path}{key}").pixels, COUNTS)
+    path.unlink()
+    WRITERS[name](path, CAPTURE=np.stack([COUNTS] * 3))
+    with pytest.raises(CaptureFileError, match=r"give one image, pixels\[0\], or colours as"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "words"),
+    [("a.fits.gz", b"\x1f\x8b\10", "gunzip a.fits.gz"), ("a.pgm", b"P2\n", "a PGM in text")],
+)
+def test_others_by_their_name(tmp_path, name, start, words):
+    (tmp_path / name).write_bytes(start + bytes(40))
+    with pytest.raises(CaptureFileError, match=words):
+        read_image(tmp_path / name)
+
+
 @pytest.mark.parametrize("name", ["a.npz", "a.mat", "a.h5", "v73.mat"])
 def test_damaged_containers_give_one_line(tmp_path, name):
     WRITERS[name](tmp_path / name, CAPTURE=COUNTS)
@@ -142,19 +164,49 @@ def packed(counts, bits, padding):
     return bytes(rows)
 
 
-@pytest.mark.parametrize("bits", [10, 12])
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
 @pytest.mark.parametrize("padding", [0, 7])
-def test_packed_frames_by_the_line_that_the_refusal_gives(tmp_path, bits, padding):
+def test_frames_without_a_header_by_the_name_that_the_refusal_gives(tmp_path, bits, padding):
     counts = RNG.integers(0, 2**bits, (6, 12), dtype=np.uint16)
     path = tmp_path / f"a.raw{bits}"
-    path.write_bytes(packed(counts, bits, padding))
-    with pytest.raises(CaptureFileError, match="counts without their size; numpy.save") as caught:
+    plain = counts.astype("u1" if bits == 8 else "<u2")
+    rows = [row.tobytes() + bytes(padding) for row in plain]
+    path.write_bytes(packed(counts, bits, padding) if bits in (10, 12) else b"".join(rows))
+    with pytest.raises(CaptureFileError, match="counts without their size") as caught:
         read_image(path)
-    line = str(caught.value).split("; ")[1].replace("bits=10", f"bits={bits}")
-    exec(line, {"numpy": np, "measured": measured, "rows": 6, "columns": 12})
-    np.testing.assert_array_equal(read_image(tmp_path / "a.npy", bits=bits).pixels, counts)
-    with pytest.raises(measured.MeasurementError, match="bytes are no 6×40 of"):
-        unpack_raw(path, (6, 40), bits)
+    given = re.search(r"as (\S+),", str(caught.value))[1].replace("ROWSxCOLUMNS", "6x12")
+    found = read_image(tmp_path / given)
+    np.testing.assert_array_equal(found.pixels, counts)
+    assert found.bits == bits
+    path.rename(tmp_path / "a.raw")
+    np.testing.assert_array_equal(read_image(tmp_path / f"a.raw:6x12x{bits}").pixels, counts)
+    if not padding:
+        np.testing.assert_array_equal(read_image(tmp_path / "a.raw:6x12").pixels, counts)
+    for wrong in ("6x40", f"7x12x{bits}", f"6x9999x{bits}"):
+        with pytest.raises(CaptureFileError, match="bytes are no"):
+            read_image(tmp_path / f"a.raw:{wrong}")
+    with pytest.raises(CaptureFileError, match=r"b.raw: cannot be read \(No such file"):
+        read_image(tmp_path / "b.raw:6x12")
+    with pytest.raises(measured.MeasurementError, match="bits = 14; give 8, 10, 12 or 16"):
+        unpack_raw(tmp_path / "a.raw", (6, 12), 14)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_a_width_and_a_height_in_the_wrong_order(tmp_path, bits):
+    """Rows of a smooth image are alike at its own width; those of noise at any."""
+    y, x = np.indices((24, 32))
+    smooth = ((2**bits - 1) * np.exp(-((y - 9) ** 2 + (x - 20) ** 2) / 60)).astype(np.uint16)
+    noise = RNG.integers(0, 2**bits, (24, 32), dtype=np.uint16)
+    path = tmp_path / f"a.raw{bits}"
+    for image in (smooth, noise):
+        plain = image.astype("u1" if bits == 8 else "<u2")
+        path.write_bytes(packed(image, bits, 0) if bits in (10, 12) else plain.tobytes())
+        np.testing.assert_array_equal(read_image(f"{path}:24x32").pixels, image)
+        if image is smooth:
+            with pytest.raises(CaptureFileError, match="give rows, then columns: 24x32"):
+                read_image(f"{path}:32x24")
+        else:
+            assert read_image(f"{path}:32x24").pixels.shape == (32, 24)
 
 
 @pytest.mark.parametrize("name", ["a.bmp", "a.gif", "a.webp"])

@@ -141,11 +141,32 @@ def test_dead_pixels_are_left_out_of_means():
     assert np.argwhere(~found.valid).tolist() == [[0, 2, 5]]
     block = capture[4:8, 8:12].astype(float)
     np.testing.assert_allclose(found.capture[0, 1, 2] * 4095, (block.sum() - 4000) / 15, rtol=1e-6)
-    # The block that nobody measured is a copy of one of its four neighbours.
-    neighbours = [found.capture[0, *place] for place in ((1, 5), (3, 5), (2, 4), (2, 6))]
-    assert found.capture[0, 2, 5] in neighbours
+    # The block that nobody measured is the mean of its four neighbours.
+    for image in (found.capture[0], found.psf[0]):
+        neighbours = [image[place] for place in ((1, 5), (3, 5), (2, 4), (2, 6))]
+        assert image[2, 5] == pytest.approx(np.mean(neighbours), rel=1e-6)
     assert found.log.capture.dead == 17
-    assert found.psf[0, 2, 5] in [found.psf[0, *p] for p in ((1, 5), (3, 5), (2, 4), (2, 6))]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint16])
+@pytest.mark.parametrize("hole", [np.s_[:10, :10], np.s_[6:8, 8:14], np.s_[:, 7], np.s_[::6]])
+def test_no_level_is_that_of_a_hole(dtype, hole):
+    """Pixels without a value are between their neighbours: levels are those of the whole image."""
+    y, x = np.indices((48, 60)) - 25.5
+    psf = (64 + 3000 * np.exp(-(y**2 + x**2) / 90) + (y + x) % 5).astype(dtype)
+    whole = Raw(psf, bits=12)
+    mask = np.zeros(psf.shape, bool)
+    mask[hole] = True
+    holed = np.ma.masked_array(psf, mask)
+    if dtype == np.float32:
+        holed = np.where(mask, np.float32(np.nan), psf)
+    found, capture = Raw(holed, bits=12), Raw(psf[::-1].copy(), bits=12)
+    assert found.dead is not None and np.array_equal(found.dead, mask)
+    levels = [prepare(one, capture).log for one in (whole, found)]
+    assert levels[1].psf.level == pytest.approx(levels[0].psf.level, abs=2 / 4095)
+    assert levels[1].capture.dead == 0 and levels[1].valid_share == 1
+    light = prepare(found, capture).psf
+    assert np.abs(light - prepare(whole, capture).psf).max() < 0.05 * light.max()
 
 
 def test_noise_of_the_corner_sets_the_threshold():

@@ -163,6 +163,18 @@ def test_it_does_not_adapt_where_the_objective_has_risen():
     assert adapted == [1, 3, 5, 6]
 
 
+@pytest.mark.parametrize(
+    ("path", "iterations"),
+    [([0, 150, 105, 95, 90], 4), ([0, 150, 130, 120], 2), ([0, 90, 99, 80], 2)],
+)
+def test_it_ends_where_the_objective_stays_above(path, iterations):
+    """From 100: one that falls by more than it is above goes on, one that has risen does not."""
+    method, first = Walk(jnp.asarray(path, dtype=float)), jnp.full((1, 1, 1, 1), 100.0)
+    schedule = Schedule(len(path) - 1, 0.0, check_every=1, rising=0.01)
+    outcome = iterate(method, first, schedule)
+    assert outcome.iterations == iterations and outcome.status == "iterations_exhausted"
+
+
 def test_a_batch_is_judged_by_its_sum():
     class Batch(Walk):
         def image(self, state):

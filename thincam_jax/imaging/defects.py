@@ -1,4 +1,4 @@
-"""Values of an image that measure no light: a plateau where it is cut off, defective pixels."""
+"""Values that measure no light: a plateau where light is cut off, defective, unknown pixels."""
 
 import functools
 
@@ -13,6 +13,8 @@ _CERTAIN = 8.0  # standard deviations of the noise, or counts
 _SPREAD = 0.1  # share of a point of light that its neighbours have at least
 _OUTER = np.flatnonzero(np.pad(np.zeros((3, 3)), 1, constant_values=1))  # of 5×5 pixels
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
+_SWEEPS = 30  # of a relaxation, from means of blocks
+_MOST, _WIDE = 0.1, 4  # share of pixels at one value, and width of lines, that are stuck
 
 
 def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
@@ -59,6 +61,71 @@ def defects(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarr
     light = np.maximum(np.abs(plane - middle) - floor / 2, 0)
     is_structure = 2 * sharp.sum() > odd.sum() or light[odd].sum() > 0.3 * light.sum()
     return odd & ~is_structure
+
+
+def stuck(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray, "y x"]:
+    """Map of pixels at a lowest value that none comes near, and of lines of one value.
+
+    A sensor's black level lies above 0 by more than its noise: blocks and padding at 0 do not. Up
+    to `_WIDE` lines that are the lowest or highest value throughout, beside others that are not.
+
+    - `step`: step between values, 1 for counts.
+    """
+    low, high = plane.min(), plane.max()
+    found, others = np.zeros(plane.shape, bool), plane[plane > low]
+    if min(plane.shape) < 8 or others.size == 0:
+        return found
+    floor = max(_CERTAIN * max(fine_noise(plane), step), 0.01 * float(high - low))
+    if 1 < plane.size - others.size < _MOST * plane.size and others.min() - low > floor:
+        found |= plane == low
+    for lines, marked in ((plane, found), (plane.T, found.T)):
+        for value in (low, high):
+            share = np.pad((lines == value).mean(axis=1), 1)
+            edges = np.flatnonzero(np.diff(np.pad(share[1:-1] == 1, 1).astype(int)))
+            for first, last in edges.reshape(-1, 2):
+                alone = max(share[first], share[last + 1]) < _MOST
+                marked[first:last] |= bool(alone) and last - first <= _WIDE
+    return found
+
+
+def filled_by_neighbours(
+    plane: Shaped[np.ndarray, "y x"], unknown: Bool[np.ndarray, "y x"]
+) -> Shaped[np.ndarray, "y x"]:
+    """An image of one colour whose unknown pixels are the means of the four around them.
+
+    So are soap films (Laplace's equation): none is above or below all known pixels. The start,
+    means of ever larger blocks, and few sweeps bring near pixels there, and far ones close to it.
+    """
+    rows, columns = np.nonzero(unknown)
+    if rows.size in (0, plane.size):
+        return plane
+    values = _means_of_blocks(plane.astype(np.float64), ~unknown)
+    (height, width), beside = plane.shape, []
+    for y, x in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        near = (
+            height - 1 - abs(height - 1 - abs(rows + y)),
+            width - 1 - abs(width - 1 - abs(columns + x)),
+        )
+        beside.append(near)
+    for _ in range(_SWEEPS):
+        values[rows, columns] = np.mean([values[one] for one in beside], axis=0)
+    values = np.rint(values) if plane.dtype.kind in "iu" else values
+    return np.where(unknown, values, plane).astype(plane.dtype)
+
+
+def _means_of_blocks(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values, and where they are not known the mean of the smallest block of 2ⁿ that has one."""
+    if known.all() or max(values.shape) == 1:
+        return values
+    odd = [(0, n % 2) for n in values.shape]
+    shape = [-(-n // 2) for n in values.shape]
+    counts, sums = (
+        np.pad(one, odd).reshape(shape[0], 2, shape[1], 2).sum(axis=(1, 3))
+        for one in (known.astype(float), np.where(known, values, 0))
+    )
+    coarse = _means_of_blocks(sums / np.maximum(counts, 1), counts > 0)
+    whole = coarse.repeat(2, axis=0).repeat(2, axis=1)[: values.shape[0], : values.shape[1]]
+    return np.where(known, values, whole)
 
 
 def fine_noise(plane: np.ndarray) -> float:

@@ -23,9 +23,15 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.files import MeasurementError, read_regular
 from thincam_jax._core.image_files import ImageFileError
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.measured.raw import CaptureFileError
 
 _Arrays = dict[str, tuple[int, Callable[[], Any]]]  # bytes of each, and what reads it
 _MOST_BYTES = 2**31  # of a packed file
+_BARE = re.compile(
+    r"(?i)(.+\.(?:raw(8|10|12|16)?|bin)):(\d{1,6})[x×](\d{1,6})(?:[x×](8|10|12|16))?"
+)
+_SWAPPED = 0.6  # of that difference, if the other order is right
+_GROUPS = {8: 1, 10: 4, 12: 2, 16: 1}  # pixels that share whole bytes, of so many bits
 
 
 def read_array(kind: str, data: bytes, key: str | None) -> np.ndarray:
@@ -39,7 +45,8 @@ def read_array(kind: str, data: bytes, key: str | None) -> np.ndarray:
             raise ImageFileError(f"has no {key!r}; it holds {names}")
         size, read = arrays[next(iter(arrays)) if key is None else key]
         refuse_if_too_large("its array", size, "give a smaller one")
-        return np.asarray(read())
+        array = np.asarray(read())
+        return array[0] if array.ndim == 3 and len(array) == 1 else array
 
 
 def _open_npz(data: bytes, opened: contextlib.ExitStack) -> _Arrays:
@@ -50,7 +57,8 @@ def _open_npz(data: bytes, opened: contextlib.ExitStack) -> _Arrays:
 
 def _open_matlab(data: bytes, _: contextlib.ExitStack) -> _Arrays:
     stream, names = io.BytesIO(data), ("char", "cell", "struct", "object", "function", "opaque")
-    found = [(n, shape) for n, shape, kind in scipy.io.whosmat(stream) if kind not in names]
+    listed = [(n, shape) for n, shape, kind in scipy.io.whosmat(stream) if kind not in names]
+    found = [(n, shape) for n, shape in listed if math.prod(shape) > 1]  # no exposure time
     load = partial(scipy.io.loadmat, stream)
     return {n: (8 * math.prod(s), lambda n=n: load(variable_names=[n])[n]) for n, s in found}
 
@@ -108,26 +116,70 @@ def read_pgm(data: bytes) -> tuple[list[np.ndarray], dict[str, Any]]:
 
 @checked
 def unpack_raw(
-    path: str | os.PathLike[str], shape: tuple[int, int], bits: int
-) -> UInt16[np.ndarray, "y x"]:
-    """Counts of a frame packed as raw10 or raw12 (MIPI CSI-2), as a Raspberry Pi writes it.
+    path: str | os.PathLike[str], shape: tuple[int, int], bits: int | None = None
+) -> UInt8[np.ndarray, "y x"] | UInt16[np.ndarray, "y x"]:
+    """Counts of a frame without a header: of 8 or 16 bit, or packed as raw10 or raw12 (MIPI CSI-2).
 
-    - `shape`: rows and columns; bytes that pad the rows are left out. `bits`: 10 or 12.
+    - `shape`: rows and columns; bytes that pad the rows are left out. `bits`: 8, 10, 12 or 16
+      (little-endian); None: those of a file without such bytes.
 
     Four pixels of 10 bit are four bytes of their upper bits and one of the lower ones, the first
-    pixel's lowest; two of 12 bit are two bytes and one.
+    pixel's lowest; two of 12 bit are two bytes and one, as of a Raspberry Pi.
 
     **Errors**: MeasurementError for other bits, and a file of another size.
     """
     rows, columns = checks.shape2d("shape", shape)
-    if bits not in (10, 12):
-        raise MeasurementError(f"bits = {bits}; give 10 or 12")
+    if bits not in (None, *_GROUPS):
+        raise MeasurementError(f"bits = {bits}; give 8, 10, 12 or 16")
     data = np.frombuffer(read_regular(path, _MOST_BYTES), np.uint8)
-    group = 4 if bits == 10 else 2
-    groups, stride = -(-columns // group), len(data) // rows
-    if len(data) % rows or not 0 <= stride - groups * (group + 1) < 256:
-        raise MeasurementError(f"{path}: {len(data)} bytes are no {rows}×{columns} of {bits} bit")
-    return unpacked(data.reshape(rows, stride), columns, bits)
+    stride = len(data) // rows
+    needed = {n: -(-columns // size) * (size * n // 8) for n, size in _GROUPS.items()}
+    fitting = [
+        n for n, one in needed.items() if one == stride or (n == bits and stride < one + 256)
+    ]
+    kept = bits or next(iter(fitting), None)
+    if len(data) % rows or kept not in fitting or stride < needed[kept]:
+        said = "8, 10, 12 or 16" if bits is None else f"{bits}"
+        more = "; give bits if rows are padded" if bits is None else ""
+        text = f"{len(data)} bytes are no {rows}×{columns} of {said} bit{more}"
+        raise MeasurementError(f"{path}: {text}")
+    lines = data.reshape(rows, stride)[:, : needed[kept]]
+    if kept in (8, 16):
+        return lines.copy() if kept == 8 else np.ascontiguousarray(lines).view("<u2")
+    return unpacked(lines, columns, kept)
+
+
+def read_bare(text: str) -> tuple[np.ndarray, dict[str, Any]] | None:
+    """Counts of "file.raw10:480x640" or "file.raw:480x640x12", and their bits; None for others.
+
+    Bits that are not given are those of the name, or of the size.
+
+    **Errors**: CaptureFileError for a file that cannot be read, or of another size.
+    """
+    named = _BARE.fullmatch(text)
+    if named is None:
+        return None
+    name, told, rows, columns, given = named.groups()
+    bits = int(given or told or 0) or None
+    shape = int(rows), int(columns)
+    try:
+        found = unpack_raw(name, shape, bits)
+        other = np.zeros((0, 0))
+        with contextlib.suppress(MeasurementError):  # as a width and a height, if those fit as well
+            other = unpack_raw(name, shape[::-1], bits)
+    except OSError as error:
+        raise CaptureFileError(f"{name}: cannot be read ({error.strerror or error})") from None
+    except ValueError as error:
+        raise CaptureFileError(str(error)) from None
+    if _unlike(other) < _SWAPPED * _unlike(found):
+        text = f"{name}: rows of {rows}x{columns} differ as of another width"
+        raise CaptureFileError(f"{text}; give rows, then columns: {columns}x{rows}")
+    return found, {"bits": bits} if bits else {}
+
+
+def _unlike(image: np.ndarray) -> float:
+    """Mean difference of pixels to the second ones below them, of one colour."""
+    return float(np.abs(image[2:].astype(float) - image[:-2]).mean()) if len(image) > 2 else np.inf
 
 
 def unpacked(

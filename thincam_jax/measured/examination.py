@@ -10,19 +10,21 @@ from jaxtyping import Bool, Float
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_mean, central_blocks
-from thincam_jax.imaging.defects import RING, defects, fine_noise, plateau
+from thincam_jax.imaging.defects import defects, fine_noise, plateau, stuck
 from thincam_jax.measured.options import Preparation
-from thincam_jax.measured.raw import Raw
+from thincam_jax.measured.raw import Raw, with_dead
 
 _DIM, _LIT, _SATURATED, _BORDER, _COLOURED = 2.0, 25.0, 5.0, 10.0, 3.0  # %
 _TILES, _COARSE = 8, 64
-_FLAT = 0.1  # of a PSF's bright pixels
+_FLAT, _MANY = 0.1, 0.1  # of a PSF's bright pixels, and of all
 # Unit and consequence, and what mends it.
 _TEXTS = {
     "plateau": "% of the pixels have the largest value, {}, and are not used; give {} to say so",
     "flat": "% of the pixels have the largest value, {}, where the light is cut off; expose less",
     "defective": "hot or dead pixels are not used; give a map of them with --dead",
     "replaced": "hot or dead pixels are filled by their neighbours; subtract a dark frame",
+    "unknown": "pixels without a value, rows {}, columns {}, are filled by their neighbours; "
+    "measure the PSF again there",
     "mosaic": "% is the step between pixels, as of a colour sensor, which shows; give --bayer {}",
     "no mosaic": "% is the step between pixels, not as of a colour sensor; leave --bayer out",
     "overexposed": "% of the pixels are saturated: the image is a guess there; expose less",
@@ -75,7 +77,9 @@ def examine(
 
     - plateau: many pixels share the largest value, and few each of the next lower ones.
     - defective: single pixels beyond all neighbours of their colour by a multiple of their range,
-      without the blur of light, in most of the captures, in images without structure as fine.
+      without the blur of light, in most of the captures, in images without structure as fine;
+      pixels at a lowest value that none comes near, and lines of one value.
+    - unknown: NaN, masked or dead pixels of a PSF. Those of captures are not used, as by `Raw`.
     - mosaic: the means of the pixels of 2×2 differ, but not those of one diagonal, green.
     - exposure, and a PSF whose light varies along its border; a computed one is not examined.
     - swapped: the capture as PSF explains the PSF as capture, and not the reverse.
@@ -88,14 +92,19 @@ def examine(
     for n, odd in enumerate(maps):
         is_psf, raw = n == count, images[n]
         where = f"{'PSF' if is_psf else 'capture'} {raw.name}"
-        images[n] = raw = _examined(raw, where, options, findings)
-        same = [one for one in maps[:count] if one.shape == odd.shape]
+        if is_psf and raw.dead is not None:
+            spans = [np.flatnonzero(raw.dead.any(axis=axis))[[0, -1]] for axis in (1, 0)]
+            words = (f"{first} to {last}" for first, last in spans)
+            is_severe = bool(raw.dead.mean() > _MANY)
+            findings.append(finding("unknown", where, float(raw.dead.sum()), is_severe, *words))
         if is_psf and odd.any():
             findings.append(finding("replaced", where, float(odd.sum())))
-            images[n] = _filled(raw, odd, _mosaic(raw, options))
-        elif not is_psf and (odd := odd & (2 * np.sum(same, axis=0) > len(same))).any():
+            raw = with_dead(raw, odd)
+        images[n] = raw = _examined(raw, where, options, findings)
+        same = [one for one in maps[:count] if one.shape == odd.shape]
+        if not is_psf and (odd := odd & (2 * np.sum(same, axis=0) > len(same))).any():
             findings.append(finding("defective", where, float(odd.sum())))
-            images[n] = replace(raw, dead=odd if raw.dead is None else odd | raw.dead)
+            images[n] = with_dead(raw, odd)
     if is_measured and captures and images[0].pixels.shape[:2] == images[-1].pixels.shape[:2]:
         left, other = _unexplained(images[-1], images[0]), _unexplained(images[0], images[-1])
         if 0 < other < left / 2:
@@ -104,22 +113,14 @@ def examine(
 
 
 def defective_pixels(raw: Raw, is_mosaic: bool = False) -> Bool[np.ndarray, "y x"]:
-    """Map of single pixels that differ from all neighbours of their colour as no light does."""
+    """Map of pixels and lines that differ from all neighbours of their colour as no light does."""
     found = np.zeros(raw.pixels.shape[:2], bool)
     for part in _phases(is_mosaic):
         planes = np.atleast_3d(raw.pixels[part]).astype(np.float32)
         for plane in np.moveaxis(planes, -1, 0):
-            found[part] |= defects(plane, float(raw.pixels.dtype.kind == "u"))
+            step = float(raw.pixels.dtype.kind == "u")
+            found[part] |= defects(plane, step) | stuck(plane, step)
     return found if raw.dead is None else found & ~raw.dead
-
-
-def _filled(raw: Raw, odd: np.ndarray, is_mosaic: bool) -> Raw:
-    pixels = raw.pixels.copy()
-    ring = RING if raw.pixels.ndim == 2 else RING[..., None]
-    for part in _phases(is_mosaic):
-        around = scipy.ndimage.median_filter(raw.pixels[part], footprint=ring, mode="mirror")
-        pixels[part][odd[part]] = around[odd[part]]
-    return replace(raw, pixels=pixels)
 
 
 def _phases(is_mosaic: bool) -> list[tuple[slice, slice]]:

@@ -104,18 +104,12 @@ def _whole(value: Any) -> bool:
 
 
 def by_files(
-    psf: Raw,
-    capture: Raw,
-    background: Any,
-    options: Preparation | None,
-    psf_background: Any,
-    dead: np.ndarray | None,
-) -> tuple[Preparation, dict[str, Any], np.ndarray | None]:
-    """Options, backgrounds of "psf" and "capture", and dead pixels of a preparation.
+    psf: Raw, capture: Raw, background: Any, options: Preparation | None, psf_background: Any
+) -> tuple[Preparation, dict[str, Any]]:
+    """Options, and backgrounds of "psf" and "capture", of a preparation.
 
-    By the files where nothing is given: pattern, black levels; their dead pixels join those that
-    are given. A background that nobody knows is "found". **Errors**: MeasurementError for two
-    patterns.
+    By the files where nothing is given: pattern, black levels. A background that nobody knows is
+    "found". **Errors**: MeasurementError for two patterns.
     """
     options = options or Preparation()
     stated = dict.fromkeys(raw.bayer for raw in (capture, psf) if raw.bayer)
@@ -135,17 +129,14 @@ def by_files(
         psf_background = background if none or psf.bits == capture.bits else "found"
     if _is(psf_background, "found"):
         psf_background = next((level for level in levels[::-1] if level is not None), "found")
-    for raw in (capture, psf):
-        if raw.dead is not None and raw.dead.shape == capture.pixels.shape[:2]:
-            dead = raw.dead if dead is None else dead | raw.dead
-    return options, {"psf": psf_background, "capture": background}, dead
+    return options, {"psf": psf_background, "capture": background}
 
 
 def _is(background: Any, name: str) -> bool:
     return isinstance(background, str) and background == name
 
 
-def _check_file(name: str, raw: Raw, background: Any, dead: Any, options: Preparation) -> None:
+def _check_file(name: str, raw: Raw, background: Any, options: Preparation) -> None:
     """Refuse what contradicts the facts of a file, and drops them."""
     where = f"the {name}'s file ({raw.name}) says"
     if raw.bayer is not None and raw.bayer != options.bayer:
@@ -157,11 +148,6 @@ def _check_file(name: str, raw: Raw, background: Any, dead: Any, options: Prepar
         given = "a dark corner" if background == "corner" else f"background = {background}"
         raise MeasurementError(
             f"{where} a black level of {level:g}, not {given}; give {level:g}, or a dark frame"
-        )
-    if raw.dead is not None and not np.all(raw.dead <= (False if dead is None else dead)):
-        raise MeasurementError(
-            f"the {name} ({raw.name}) has {raw.dead.sum()} NaN or masked pixels of "
-            f"{_size(raw)}; mark them in a map of the capture's size, dead=raw.dead"
         )
 
 
@@ -185,6 +171,8 @@ def check_match(
             f"the map of dead pixels has {dead.shape[0]}×{dead.shape[1]} pixels and the capture "
             f"{_size(capture)}; give a map of the same part of the sensor"
         )
+    if dead is not None and dead.all():
+        raise MeasurementError("the PSF has a channel of dead pixels only; check the map `dead`")
     if options.bayer is not None:
         for name, raw in (("PSF", psf), ("capture", capture)):
             if raw.channels > 1:
@@ -209,8 +197,7 @@ def check_match(
         )
     for name, raw in (("psf", psf), ("capture", capture)):
         _check_background(name, raw, psf, backgrounds[name])
-        hidden = dead if dead is None or dead.shape == raw.pixels.shape[:2] else None
-        _check_file({"psf": "PSF"}.get(name, name), raw, backgrounds[name], hidden, options)
+        _check_file({"psf": "PSF"}.get(name, name), raw, backgrounds[name], options)
 
 
 def _size(raw: Raw) -> str:

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, Float32
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
+from thincam_jax.imaging.defects import filled_by_neighbours
 from thincam_jax.measured.bayer import demosaic, demosaic_mask, demosaiced
 from thincam_jax.measured.merging import FoundLevels, corner_levels, find_levels
 from thincam_jax.measured.options import Centre, Preparation, by_files, check_match
-from thincam_jax.measured.raw import MeasurementError, Raw
+from thincam_jax.measured.raw import MeasurementError, Raw, with_dead
 from thincam_jax.measured.sensor import SensorCalibration
 from thincam_jax.measured.write import Centring, CleanUp, ImageLog, PreparationLog
 
@@ -90,7 +91,7 @@ def prepare(
     10. The PSF to unit sum, the capture by `capture_scale`.
 
     In 4 and 6 dead pixels are left out of the means, as they are missing at random; a value without
-    any good pixel is invalid and copied from the nearest good one. A saturated pixel invalidates
+    any good pixel is invalid and filled by its neighbours. A saturated pixel invalidates
     every value that it enters, because a mean of the others would be too dark. Saturated pixels of
     the PSF are only counted in the log; they call for a PSF of shorter exposure.
 
@@ -99,16 +100,14 @@ def prepare(
 
     Pattern, black levels and dead pixels that nobody gives are those of the files.
     """
-    options, backgrounds, dead = by_files(psf, capture, background, options, psf_background, dead)
-    raws = {"psf": psf, "capture": capture}
+    options, backgrounds = by_files(psf, capture, background, options, psf_background)
     check_match(psf, capture, backgrounds, dead, options)
+    raws = {"psf": with_dead(psf, dead), "capture": with_dead(capture, dead)}
     planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
     found = _found(planes, backgrounds, raws, options)
     levels = {n: _level(b, raws[n], found.levels[n]) for n, b in backgrounds.items()}
-    good = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
     frames = {
-        n: _frame(raws[n], plane, backgrounds[n], levels[n], good, options)
-        for n, plane in planes.items()
+        n: _frame(raws[n], plane, backgrounds[n], levels[n], options) for n, plane in planes.items()
     }
     noise = _noise(frames["psf"].values[found.square].astype(np.float64), options)
     kinds = {n: _kind(b, raws[n], found.sources[n]) for n, b in backgrounds.items()}
@@ -209,15 +208,12 @@ def _image_log(raw: Raw, background: str, level: np.ndarray, frame: _Frame) -> I
 
 
 def _frame(
-    raw: Raw,
-    plane: np.ndarray,
-    background: Background,
-    level: np.ndarray,
-    good: np.ndarray,
-    options: Preparation,
+    raw: Raw, plane: np.ndarray, background: Background, level: np.ndarray, options: Preparation
 ) -> _Frame:
     """An image, `plane` in full scale, without its background."""
-    saturated, good = _saturated(raw, plane, options), _known(good, plane.shape)
+    saturated, good = _saturated(raw, plane, options), np.ones(plane.shape, bool)
+    if raw.dead is not None:
+        good = np.broadcast_to(~raw.dead, plane.shape)
     if not isinstance(background, SensorCalibration):
         return _Frame(plane - level, saturated, good, np.zeros_like(plane))
     light, variance = (one[None].astype(np.float32) for one in background.correct(raw))
@@ -288,11 +284,6 @@ def _cropped(frame: _Frame, crop: tuple[tuple[int, int], tuple[int, int]]) -> _F
     return _Frame(*(plane[:, *parts] for plane in vars(frame).values()))
 
 
-def _known(known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Map of good pixels; all those of a PSF of another sensor."""
-    return np.broadcast_to(known, shape) if known.shape == shape[1:] else np.ones(shape, bool)
-
-
 def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
     """A PSF enlarged about its middle by cubic splines, zero-padded to at least a shape.
 
@@ -346,20 +337,15 @@ def _means(frame: _Frame, factor: int) -> _Frame:
 
 
 def _filled(frame: _Frame, name: str) -> np.ndarray:
-    """The image with each unknown value replaced by the nearest known one."""
+    """The image with each unknown value between those around it."""
     if frame.known.all():
         return frame.values
     if not frame.known.any(axis=(1, 2)).all():
         raise MeasurementError(
             f"the {name} has a channel of dead pixels only; check the map `dead`"
         )
-    planes = []
-    for values, known in zip(frame.values, frame.known, strict=True):
-        nearest = scipy.ndimage.distance_transform_edt(
-            ~known, return_distances=False, return_indices=True
-        )
-        planes.append(values[tuple(nearest)])  # pyright: ignore[reportArgumentType]
-    return np.stack(planes)
+    pairs = zip(frame.values, frame.known, strict=True)
+    return np.stack([filled_by_neighbours(values, ~known) for values, known in pairs])
 
 
 def _psf_divisor(psf: np.ndarray, options: Preparation) -> np.ndarray:

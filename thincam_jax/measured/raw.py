@@ -1,7 +1,7 @@
 """A measured image as the camera stored it, with its bit depth, and its validation."""
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers, without_mask
 from thincam_jax._core.files import MeasurementError
+from thincam_jax.imaging.defects import filled_by_neighbours
 from thincam_jax.measured.bayer import Pattern
 
 MAX_CHANNELS = 4
@@ -34,7 +35,8 @@ class Raw:
       where it does not. The white level is then the full scale.
     - `exposure`: time by its file, s. `saturation`: count from which pixels are
       saturated, where that is below full scale.
-    - `dead`: map (y, x) of pixels that are NaN or masked; they are 0 in `pixels`. None: no such.
+    - `dead`: map (y, x) of pixels that are NaN or masked; in `pixels` they are filled by their
+      neighbours, so that no level or largest value is taken from them. None: no such.
 
     **Errors**: MeasurementError for another shape or type, an empty image, infinite values, no
     value that is a number, and values above 2^bits − 1. Signed integers are refused, but not
@@ -63,19 +65,21 @@ class Raw:
         bits = 8 * pixels.dtype.itemsize if self.bits is None and pixels.dtype.kind == "u" else None
         if self.bits is not None:
             bits = _announced(self.name, self.bits, pixels)
-        dead = np.isnan(pixels) if pixels.dtype.kind == "f" else np.zeros(pixels.shape, bool)
-        dead = dead | (False if masked is None else masked)
-        if dead.any():
-            pixels = np.where(dead, 0, pixels).astype(pixels.dtype)
-            dead = dead if dead.ndim == 2 else dead.any(axis=2)
-            object.__setattr__(self, "dead", dead if self.dead is None else dead | self.dead)
+        unknown = np.isnan(pixels) if pixels.dtype.kind == "f" else np.zeros(pixels.shape, bool)
+        unknown = unknown | (False if masked is None else masked)
+        if unknown.any():
+            dead = unknown if unknown.ndim == 2 else unknown.any(axis=2)
             _LOGGER.warning("%s: %d pixels are NaN or masked: taken as dead", self.name, dead.sum())
+            object.__setattr__(self, "dead", dead if self.dead is None else dead | self.dead)
+        if self.dead is not None:
+            unknown = unknown | (self.dead if pixels.ndim == 2 else self.dead[..., None])
         bad = int(np.isinf(pixels).sum()) if pixels.dtype.kind == "f" else 0
         if bad or (self.dead is not None and self.dead.all()):
             raise MeasurementError(
-                f"{self.name}: {bad or pixels.size} of {pixels.size} values are NaN or infinite; "
-                "give finite ones"
+                f"{self.name}: {bad or int(unknown.sum())} of {pixels.size} values are NaN or "
+                "infinite; give finite ones"
             )
+        pixels = _filled(pixels, unknown)
         if bits is not None:
             _check_range(self.name, pixels, bits)
         native = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
@@ -95,12 +99,35 @@ class Raw:
         return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
 
 
+def with_dead(raw: Raw, dead: np.ndarray | None) -> Raw:
+    """The image with further dead pixels, if the map has its size."""
+    if dead is None or dead.shape != raw.pixels.shape[:2]:
+        return raw
+    return replace(raw, dead=dead if raw.dead is None else dead | raw.dead)
+
+
+def _filled(pixels: np.ndarray, dead: np.ndarray) -> np.ndarray:
+    """The image without its dead pixels; one channel may be a mosaic of 2×2 colours."""
+    if not dead.any():
+        return pixels
+    found = np.where(dead, 0, pixels).astype(pixels.dtype)
+    for n in range(4 if pixels.ndim == 2 else pixels.shape[2]):
+        part = np.s_[n // 2 :: 2, n % 2 :: 2] if pixels.ndim == 2 else np.s_[:, :, n]
+        found[part] = filled_by_neighbours(found[part], dead[part])
+    return found
+
+
 def _check_shape(name: str, pixels: np.ndarray) -> None:
     if pixels.size == 0:
         raise MeasurementError(f"{name}: is empty (shape {pixels.shape}); give an image")
     if pixels.ndim not in (2, 3):
         raise MeasurementError(
             f"{name}: has shape {pixels.shape}; give an image (y, x) or (y, x, channel)"
+        )
+    if pixels.ndim == 3 and pixels.shape[0] <= MAX_CHANNELS < pixels.shape[2] / 4:
+        raise MeasurementError(
+            f"{name}: has shape {pixels.shape}; give one image, pixels[0], or colours as the last "
+            "axis, numpy.moveaxis(pixels, 0, -1)"
         )
     if pixels.ndim == 3 and pixels.shape[2] > MAX_CHANNELS:
         raise MeasurementError(

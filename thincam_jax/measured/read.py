@@ -33,17 +33,19 @@ from thincam_jax._core.image_files import (
 )
 from thincam_jax.imaging.encoding import ORIENTATION, upright
 from thincam_jax.measured.bayer import PATTERNS, turned_pattern
-from thincam_jax.measured.containers import OPENERS, read_array, read_pgm
+from thincam_jax.measured.containers import OPENERS, read_array, read_bare, read_pgm
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
 _Facts = dict[str, Any]  # bits, orientation, and those of `Raw`, where a file says them
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy", ".pgm", ".ppm", ".fits", *RAW_SUFFIXES)
 _KEYED = re.compile(r"(?i)(.+\.(?:npz|mat|h5|hdf5|fits?)):(.+)")
+_BARE = (".raw", ".raw8", ".raw10", ".raw12", ".raw16", ".bin")  # counts alone
 # By their first bytes, or those after a length: names, and what imageio is to read.
 _OTHERS = {
     **{b"GIF8": ("a GIF", ", index=0"), b"BM": ("a BMP", ""), b"WEBP": ("a WebP", "")},
     **{b"AVI ": ("an AVI film", ", index=0"), b"ftyp": ("an MP4 film or HEIF", ", index=0")},
+    b"P2": ("a PGM in text", ""),
     **{b"jP  ": ("a JPEG 2000", ""), b"v/1\1": ("an OpenEXR", ""), b"8BPS": ("a PSD", "")},
 }
 # Photometric interpretations that hold counts: no palette, inverted scale or colour difference.
@@ -71,7 +73,9 @@ def read_image(path: str | os.PathLike[str], *, bits: int | None = None) -> Raw:
     """Read one image as it is stored, without scaling or gamma.
 
     TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY; PGM and PPM;
-    an array of NPZ, MATLAB, HDF5 or FITS, by its key as "file.mat:capture" where there are several.
+    an array of NPZ, MATLAB, HDF5 or FITS, by its key as "file.mat:capture" where there are several;
+    counts without a header by their rows and columns, as "file.raw10:480x640" or
+    "file.raw:480x640x12" (see `unpack_raw`).
     An opaque alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is
     read with a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files
     of cameras need the extra `raw`; they give their mosaic (y, x) with the black level in it, and
@@ -217,6 +221,8 @@ def _decode(
     named = _KEYED.fullmatch(str(path))
     inside = named and data is None and not path.exists()
     path, key = (Path(named[1]), named[2]) if named and inside else (path, None)
+    if data is None and not path.exists() and (bare := read_bare(str(path))):
+        return [bare[0]], "raw", bare[1]
     kind = _kind(path) if data is None else kind_of_start(data[:8], path.suffix)
     if not kind:
         raise CaptureFileError(f"{path}: is no image that can be read; {_UNDAMAGED}")
@@ -252,10 +258,11 @@ def _true_name(path: Path) -> str:
     """Kind of a file that is not read, and the line of Python that brings it in."""
     with open_regular(path) as (file, _):
         start = file.read(12)
+    if path.suffix.lower() in _BARE:
+        return f"is counts without their size; give it as {path.name}:ROWSxCOLUMNS, or with xBITS"
     array = f"numpy.save({str(path.with_suffix('.npy'))!r}"
-    if path.suffix.lower() in (".raw", ".raw10", ".raw12", ".bin"):
-        given = f"measured.containers.unpack_raw({str(path)!r}, (rows, columns), bits=10)"
-        return f"is packed counts without their size; {array}, {given})"
+    if start[:2] == b"\x1f\x8b":
+        return f"is compressed by gzip; gunzip {path.name}"
     for first, (name, call) in _OTHERS.items():
         if first in (start[: len(first)], start[4 : 4 + len(first)], start[8 : 8 + len(first)]):
             return f"is {name}; {array}, imageio.v3.imread({str(path)!r}{call}))"

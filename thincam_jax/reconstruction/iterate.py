@@ -175,7 +175,7 @@ class Schedule:
     - `still`: or if the image changed by less than this share of it over the last interval, and the
       objective by less than half of that.
     - `rising`: a run ends, not converged, if from its second check on the objective is above the
-      lowest one by more than this share.
+      lowest one by more than this share, and has not fallen by as much since the last check.
     - `judged`: whether residuals are looked at after `adapt_until` as well.
     """
 
@@ -258,9 +258,13 @@ def _settled(history: Sequence[Progress], share: float) -> bool:
 
 
 def _is_rising(history: Sequence[Progress], share: float) -> bool:
-    """Whether the last of three objectives or more is above the lowest one."""
+    """Whether the last of three objectives or more is above the lowest one, and stays so.
+
+    One that fell by more than it is above is below after as many iterations more.
+    """
     *before, last = (p.objective for p in history)
-    return len(before) > 1 and last > (1 + share) * min(before)
+    above = last - min(before)
+    return len(before) > 1 and above > share * min(before) and before[-1] - last < above
 
 
 def _is_still(history: Sequence[Progress], before: Image, after: Image, share: float) -> bool:
