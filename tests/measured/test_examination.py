@@ -8,6 +8,7 @@ import scipy.ndimage
 import scipy.signal
 
 import thincam_jax as tc
+from thincam_jax.imaging.defects import stuck
 from thincam_jax.measured import Preparation, Raw, prepare
 from thincam_jax.measured.bayer import mosaic
 from thincam_jax.measured.examination import defective_pixels, examine
@@ -244,7 +245,33 @@ def test_swapped(camera):
     psf, capture = Raw(counts(light, 1), 12), Raw(counts(seen(scene(), light)), 12)
     (one,) = (one for one in examine([psf], capture).findings if one.name == "swapped")
     assert one.severe and one.advice == "exchange --psf and --capture"
-    assert "swapped" not in names(examine([capture], psf))
+    assert not names(examine([capture], psf)) & {"swapped", "same"}
+    (one,) = (one for one in examine([psf], psf).findings if one.name == "same")
+    assert one.severe
+
+
+def test_a_map_that_marks_nothing():
+    psf, capture = (Raw(counts(spots(), n), 12, dead=np.zeros(SHAPE, bool)) for n in (1, 2))
+    assert not names(examine([capture], psf))
+
+
+def test_lines_of_one_value():
+    """Columns at 0 and a row at full scale are found; dark borders and rows of a code are not."""
+    rng = np.random.default_rng(3)
+    code = np.kron(rng.random((12, 15)) < 0.5, np.ones((4, 4)))
+    code[20:24] = 0
+    image = np.pad(100.0 * code, 6)
+    assert not stuck(image).any()
+    light = 50 + 20 * rng.random((60, 72))
+    light[:, 30:32], light[41] = 0, 255
+    light[41, 30:32] = 0
+    marked = stuck(light)
+    expected = np.zeros_like(marked)
+    expected[:, 30:32] = True
+    np.testing.assert_array_equal(marked, expected)
+    light[41, 30:32] = 255
+    light[41:42, 30:32] = 255
+    assert stuck(light)[41].all()
 
 
 def test_exposure_and_border():

@@ -161,12 +161,12 @@ def read_bare(text: str) -> tuple[np.ndarray, dict[str, Any]] | None:
         return None
     name, told, rows, columns, given = named.groups()
     bits = int(given or told or 0) or None
-    shape = int(rows), int(columns)
+    shape, turned = (int(rows), int(columns)), (int(columns), int(rows))
     try:
         found = unpack_raw(name, shape, bits)
         other = np.zeros((0, 0))
         with contextlib.suppress(MeasurementError):  # as a width and a height, if those fit as well
-            other = unpack_raw(name, shape[::-1], bits)
+            other = unpack_raw(name, turned, bits)
     except OSError as error:
         raise CaptureFileError(f"{name}: cannot be read ({error.strerror or error})") from None
     except ValueError as error:

@@ -31,6 +31,7 @@ _TEXTS = {
     "underexposed": "% of full scale is the brightest part; expose longer, or give its --bits",
     "cut": "% of its peak varies along its border: what is beyond is missing; compute it: --camera",
     "swapped": "% is not explained by the PSF, which it explains; exchange --psf and --capture",
+    "same": "% of the pixels are those of the PSF; give the capture of a scene, not of the point",
     "unexplained": "% of its variation is neither image nor noise; try thincam calibrate check",
     "misfit": "times the noise is left; {}",
     "noise": "counts of noise are found, and {} are given; leave --noise out if that is unsure",
@@ -82,7 +83,7 @@ def examine(
     - unknown: NaN, masked or dead pixels of a PSF. Those of captures are not used, as by `Raw`.
     - mosaic: the means of the pixels of 2×2 differ, but not those of one diagonal, green.
     - exposure, and a PSF whose light varies along its border; a computed one is not examined.
-    - swapped: the capture as PSF explains the PSF as capture, and not the reverse.
+    - swapped: the capture as PSF explains the PSF as capture, and not the reverse; same: it is it.
     """
     options = options or Preparation()
     is_measured = psf is not None and psf.sensor_shape is None
@@ -92,7 +93,7 @@ def examine(
     for n, odd in enumerate(maps):
         is_psf, raw = n == count, images[n]
         where = f"{'PSF' if is_psf else 'capture'} {raw.name}"
-        if is_psf and raw.dead is not None:
+        if is_psf and raw.dead is not None and raw.dead.any():
             spans = [np.flatnonzero(raw.dead.any(axis=axis))[[0, -1]] for axis in (1, 0)]
             words = (f"{first} to {last}" for first, last in spans)
             is_severe = bool(raw.dead.mean() > _MANY)
@@ -107,7 +108,9 @@ def examine(
             images[n] = with_dead(raw, odd)
     if is_measured and captures and images[0].pixels.shape[:2] == images[-1].pixels.shape[:2]:
         left, other = _unexplained(images[-1], images[0]), _unexplained(images[0], images[-1])
-        if 0 < other < left / 2:
+        if np.array_equal(images[0].pixels, images[-1].pixels):
+            findings.append(finding("same", f"capture {images[0].name}", 100.0, True))
+        elif 0 < other < left / 2:
             findings.append(finding("swapped", f"capture {images[0].name}", 100 * left, True))
     return Examination(tuple(findings), tuple(images[:count]), images[-1] if is_measured else psf)
 
