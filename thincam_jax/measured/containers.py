@@ -159,8 +159,8 @@ def read_bare(text: str) -> tuple[np.ndarray, dict[str, Any]] | None:
     named = _BARE.fullmatch(text)
     if named is None:
         return None
-    name, told, rows, columns, given = named.groups()
-    bits = int(given or told or 0) or None
+    name, known, rows, columns, given = named.groups()
+    bits = int(given or known or 0) or None
     shape, turned = (int(rows), int(columns)), (int(columns), int(rows))
     try:
         found = unpack_raw(name, shape, bits)
