@@ -77,8 +77,8 @@ SOLVERS = {
 def test_cost_where_there_is_none(name, solver, capsys):
     """Time and quality of a background that is found and is zero, beside `background=0`.
 
-    Of `THINCAM_MANY` (8) photographs: ratios of all iterations and of all CPU time, mean and standard
-    deviation of the ratios of single photographs, and dB gained, mean and least.
+    `THINCAM_MANY` (8) photographs: ratios of all iterations and of all CPU time, with the standard
+    deviation of single ones, and dB gained, mean and least.
     """
     if not PHOTOGRAPHS.exists():
         pytest.skip(f"needs photographs in {PHOTOGRAPHS}")

@@ -174,7 +174,8 @@ def test_frames_without_a_header_by_the_name_that_the_refusal_gives(tmp_path, bi
     path.write_bytes(packed(counts, bits, padding) if bits in (10, 12) else b"".join(rows))
     with pytest.raises(CaptureFileError, match="counts without their size") as caught:
         read_image(path)
-    given = re.search(r"as (\S+),", str(caught.value))[1].replace("ROWSxCOLUMNS", "6x12")
+    (given,) = re.findall(r"as (\S+),", str(caught.value))
+    given = given.replace("ROWSxCOLUMNS", "6x12")
     found = read_image(tmp_path / given)
     np.testing.assert_array_equal(found.pixels, counts)
     assert found.bits == bits
