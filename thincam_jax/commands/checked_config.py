@@ -19,7 +19,8 @@ def load_as(
 ) -> Experiment:
     """Read an experiment file of the given sections; `overrides` are "a.b=value" texts.
 
-    Image files of the list `model.pictured` are named from the folder of the experiment file.
+    Files of the list `model.pictured` and of sections `model.with_path` are named from the folder
+    of the experiment file.
 
     **Errors**: ConfigError with one line for each fault: file and line, field, what was given,
     what is allowed. FileNotFoundError where there is no such file.
@@ -30,13 +31,18 @@ def load_as(
     places = Places(raw, lines, asked, f"{path}:1")
     config = check_as(model, places)
     folder = path.resolve().parent
-    named = tuple(
-        entry.model_copy(update={"path": str(folder / entry.path)}) if entry.path else entry
-        for entry in getattr(config, model.pictured)
-    )
-    config = config.model_copy(update={model.pictured: named})
+    named = {model.pictured: tuple(_placed(e, folder) for e in getattr(config, model.pictured))}
+    named |= {name: _placed(getattr(config, name), folder) for name in model.with_path}
+    config = config.model_copy(update=named)
     config._places = places
     return config
+
+
+def _placed(entry: Any, folder: Path) -> Any:
+    """An entry with the whole path of its file, if it has any."""
+    if entry is None or not entry.path:
+        return entry
+    return entry.model_copy(update={"path": str(folder / entry.path)})
 
 
 def check_as(model: type[Config], places: Places) -> Config:

@@ -112,6 +112,10 @@ _ALL = {
         *("a denoiser", "train", "denoiser:DenoiserConfig", "training:lessons"),
         *("denoiser", "denoiser:build_lessons", "denoiser:run_denoiser", "learn"),
     ),
+    "trained": Kind(
+        *("a trained reconstruction", "train", "trained:TrainedConfig", "training:lessons"),
+        *("trained", "trained:build_lessons", "trained:run_trained", "learn"),
+    ),
 }
 KINDS = {name: kind for name, kind in _ALL.items() if not kind.room or has_room(kind.room)}
 

@@ -212,6 +212,7 @@ class ExperimentConfig(Section):
     """Keys that every kind of experiment file begins with."""
 
     pictured: ClassVar[str] = "targets"  # the list that has image files
+    with_path: ClassVar[tuple[str, ...]] = ()  # further sections that name a file
     name: Name
     title: str = ""
     seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0

@@ -47,7 +47,8 @@ def evaluate(
     method: Annotated[
         list[str] | None,
         Option(
-            help=f"Reconstruction method: {', '.join(METHODS)}. Repeat it to compare several.",
+            help=f"Reconstruction method: {', '.join(METHODS)}, or a file of 'thincam train'. "
+            "Repeat it to compare several.",
             autocompletion=lambda: METHODS,
         ),
     ] = None,
@@ -134,7 +135,7 @@ def evaluate(
             fit=fit,
             shift=shift,
         )
-        methods = tuple(one.replace("-", "_") for one in method or ("admm-tv",))
+        methods = tuple(options.read_method(one) for one in method or ("admm-tv",))
         config.check(methods)
         pairs = config.pairs()
         warn([f"{path}: {note}" for note in pairs.notes if "no PSF" not in note])

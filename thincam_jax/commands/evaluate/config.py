@@ -4,8 +4,15 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+from thincam_jax._core.text import slug
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.reconstruct.options import PSF_METHODS, Recipe, Sources, read_background
+from thincam_jax.commands.reconstruct.options import (
+    PSF_METHODS,
+    Recipe,
+    Sources,
+    is_trained,
+    read_background,
+)
 from thincam_jax.commands.schema import Section
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.measured.layouts import open_pairs, with_psf
@@ -15,6 +22,11 @@ from thincam_jax.studies.agreement import Fit
 # Options of solvers, and the methods that use them.
 _VARIATION = ("admm_tv", "fista", "auto")
 _USED_BY = {"tau": _VARIATION, "coupling": _VARIATION, "ridge": ("ridge",)}
+
+
+def label_of(method: str) -> str:
+    """Name of a method in tables and files."""
+    return slug(Path(method).stem) if is_trained(method) else method
 
 
 class EvaluationConfig(Section):
@@ -88,12 +100,15 @@ class EvaluationConfig(Section):
         """The method with those of the options that it has."""
         options = {name: getattr(self, name) for name, used in _USED_BY.items() if method in used}
         others = {name: getattr(self, name) for name in ("iterations", "noise", "strict")}
+        if is_trained(method):
+            del others["iterations"]
         return Recipe(method, **options, **others)
 
     def check(self, methods: tuple[str, ...]) -> None:
         """Refuse unknown methods, options that none of them has, and values out of range."""
-        if len(set(methods)) < len(methods):
-            raise ConfigError(f"--method: {', '.join(methods)} has one twice; give each once")
+        labels = [label_of(method) for method in methods]
+        if len(set(labels)) < len(labels):
+            raise ConfigError(f"--method: {', '.join(labels)} has one twice; give each once")
         for name, used in _USED_BY.items():
             if getattr(self, name) is not None and not set(used) & set(methods):
                 able = ", ".join(one.replace("_", "-") for one in used)
@@ -101,7 +116,7 @@ class EvaluationConfig(Section):
         if self.shift < 0:
             raise ConfigError(f"--shift {self.shift}: give 0 or more pixels")
         for method in methods:
-            if method not in PSF_METHODS:
+            if method not in PSF_METHODS and not is_trained(method):
                 known = ", ".join(one.replace("_", "-") for one in PSF_METHODS)
                 raise ConfigError(f"--method {method}: is unknown here; choose from {known}")
             self.recipe(method)

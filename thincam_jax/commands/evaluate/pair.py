@@ -15,12 +15,14 @@ from thincam_jax._core.files import file_digest
 from thincam_jax._core.precision import double_precision
 from thincam_jax.commands.evaluate.config import EvaluationConfig
 from thincam_jax.commands.reconstruct.jobs import Inputs
+from thincam_jax.commands.reconstruct.options import is_trained
 from thincam_jax.commands.run_folder import digest
 from thincam_jax.commands.sweep.point import one_line
 from thincam_jax.measured import MeasurementError, Raw
-from thincam_jax.measured.examination import examine
+from thincam_jax.measured.examination import Examination, examine
 from thincam_jax.measured.merging import without_hot_pixels
 from thincam_jax.measured.pairs import PairedCapture, Pairs, relative_pitch
+from thincam_jax.measured.preparation import Prepared
 from thincam_jax.studies.agreement import Agreement, agreement
 from thincam_jax.studies.prepared import check_channels, pixel_noise, reconstruct_prepared
 
@@ -79,15 +81,7 @@ def reconstructed(
 ) -> tuple[Agreement, float, dict[str, Any]]:
     """Agreement, seconds and further results, by the steps of `thincam reconstruct`."""
     asked, pairs = opened(config)
-    capture, recipe = pair.capture, asked.recipe(method)
-    scale = None if pair.psf is None else relative_pitch(pair.psf, capture)
-    rig = _rig(config, pair.mask_label, scale)
-    level: Any = pair.background or rig.background
-    if isinstance(level, Raw):
-        capture, level = without_hot_pixels(capture, level)
-    examined = examine([capture], rig.psfs[0], rig.sources.preparation)
-    ready = rig.ready(examined, level)
-    check_channels(ready, pair.name)
+    recipe, (ready, examined) = asked.recipe(method), prepared_pair(config, pair)
     if bad := [str(one) for one in examined.findings if recipe.strict and one.severe]:
         raise MeasurementError(f"{bad[0]} (an error by --strict)")
     noise = pixel_noise(ready, recipe.noise)
@@ -101,9 +95,24 @@ def reconstructed(
     return found, done.found.seconds, {**others, "findings": findings}
 
 
+def prepared_pair(config: str, pair: PairedCapture) -> tuple[Prepared, Examination]:
+    """Capture and PSF of a pair as a reconstruction takes them, and what was found in them."""
+    capture = pair.capture
+    scale = None if pair.psf is None else relative_pitch(pair.psf, capture)
+    rig = _rig(config, pair.mask_label, scale)
+    level: Any = pair.background or rig.background
+    if isinstance(level, Raw):
+        capture, level = without_hot_pixels(capture, level)
+    examined = examine([capture], rig.psfs[0], rig.sources.preparation)
+    ready = rig.ready(examined, level)
+    check_channels(ready, pair.name)
+    return ready, examined
+
+
 def key_of(config: str, method: str, number: int, double: bool) -> str:
     """Digest of files, options, package and precision of a pair's scores."""
     _, pairs = opened(config)
+    method = file_digest(Path(method)) if is_trained(method) else method
     origin = [SCORES_VERSION, _shared_origin(config), method, double, pairs.digest(number)]
     return digest(json.dumps(origin))
 

@@ -14,7 +14,7 @@ from thincam_jax._core.environment import environment
 from thincam_jax._core.precision import is_double
 from thincam_jax._core.text import slug
 from thincam_jax.commands.evaluate import page
-from thincam_jax.commands.evaluate.config import EvaluationConfig
+from thincam_jax.commands.evaluate.config import EvaluationConfig, label_of
 from thincam_jax.commands.evaluate.pair import Scored, key_of, opened, score_pair
 from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder, to_json
@@ -62,15 +62,19 @@ class EvaluationFolder(RunFolder):
 
 @dataclass(frozen=True)
 class PairTask:
-    """A pair and a method. `file`: name of its scores in the folder."""
+    """A pair and a method, and its `label`. `file`: name of its scores in the folder."""
 
     method: str
     number: int
     name: str
 
     @property
+    def label(self) -> str:
+        return label_of(self.method)
+
+    @property
     def file(self) -> str:
-        return f"{self.method}/{self.number:06d}-{slug(self.name)[:60]}"
+        return f"{self.label}/{self.number:06d}-{slug(self.name)[:60]}"
 
 
 @dataclass(frozen=True)
@@ -133,11 +137,11 @@ def run_evaluation(
     scores = {(row["number"], row["method"]): row for row in rows}
     parts = []
     for word, number in ranked.items():
-        one = {t.method: held for t, held in shown.items() if t.number == number}
+        one = {t.label: held for t, held in shown.items() if t.number == number}
         psnrs = {m: scores.get((number, m), {}).get("psnr_db") for m in one}
         name = next(task.name for task in chosen if task.number == number)
         parts.append(page.pictures(folder, word, name, one, psnrs))
-    counts = Counter(task.method for task in failures)
+    counts = Counter(task.label for task in failures)
     reasons = {task.file: reason for task, reason in failures.items()}
     findings = {f"{r['method']}, {r['name']}": r["findings"] for r in rows if r["findings"]}
     found = Evaluated(summarised(rows, counts), reasons, findings)
@@ -174,7 +178,9 @@ def _collect(
     for task in tasks:
         held = folder.held(task.file)
         if "scores" in held:
-            rows.append({**asdict(task), **held["scores"], "seconds": held["seconds"]})
+            rows.append(
+                {**asdict(task), "method": task.label, **held["scores"], "seconds": held["seconds"]}
+            )
         else:
             failures[task] = held.get("reason", "nothing was kept")
     return rows, failures

@@ -185,7 +185,8 @@ def reconstruct(
     method: Annotated[
         str,
         Option(
-            help=f"Reconstruction method: {', '.join(METHODS)}.", autocompletion=lambda: METHODS
+            help=f"Reconstruction method: {', '.join(METHODS)}, or a file of 'thincam train'.",
+            autocompletion=lambda: METHODS,
         ),
     ] = "admm-tv",
     solver: SolverOptions,
@@ -228,7 +229,7 @@ def reconstruct(
             options.read_distances(distances, psf or ()),
             options.read_exposures(exposure or (), len(psf or ()), len(capture)),
         )
-        name, settings = method.replace("-", "_"), vars(solver)
+        name, settings = options.read_method(method), vars(solver)
         recipe = options.Recipe(name, field=field, flip=flip, focusing=focusing, **settings)
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
         output = options.Output(out, linear, gamma, balance, unsure)

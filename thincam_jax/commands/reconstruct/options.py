@@ -1,6 +1,7 @@
 """Options of a reconstruction: its files, its camera, its method, and what it writes."""
 
 import contextlib
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from thincam_jax.studies.prepared import computed_psf
 from thincam_jax.units import parse_quantity
 
 PSF_METHODS = tuple(name.replace("-", "_") for name in METHODS)
+_TRAINED = ".thincam"  # suffix of the files of 'thincam train'
 DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 
 # Far beyond any use; its product with the captures' units stays within float32.
@@ -85,11 +87,29 @@ class Focusing:
     distance: float
 
 
+def is_trained(method: str) -> bool:
+    """Whether a method is the file of a trained reconstruction."""
+    return method.endswith(_TRAINED)
+
+
+def read_method(text: str) -> str:
+    """Method by its word in the shell, or the whole path of a trained reconstruction."""
+    return str(Path(text).resolve()) if is_trained(text) else text.replace("-", "_")
+
+
+@functools.lru_cache(2)
+def _read_trained(path: str, _: float) -> AbstractSolver:
+    # Here: other methods need not wait for the learned parts.
+    from thincam_jax.learn.trained import TrainedReconstruction
+
+    return TrainedReconstruction.load(path)
+
+
 @dataclass(frozen=True)
 class Recipe:
     """Settings of a reconstruction; see `thincam_jax.reconstruct`.
 
-    - `method`: one of `PSF_METHODS`.
+    - `method`: one of `PSF_METHODS`, or the file of a trained reconstruction.
     - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most;
       None: as many as the method has by default.
     - `coupling`: coupling of the colours' edges; None: "joint" for several channels.
@@ -144,6 +164,8 @@ class Recipe:
     def solver(self, channels: int) -> AbstractSolver:
         """The solver for a capture of so many colour channels."""
         limit: dict[str, Any] = {} if self.iterations is None else {"iterations": self.iterations}
+        if is_trained(self.method):
+            return self._trained()
         if self.is_ridge:
             return Ridge(self.relative_ridge, **limit)
         if self.method == "pnp":
@@ -156,12 +178,28 @@ class Recipe:
             return Fista(self.relative_tau, regulariser=variation, **limit)
         return AdmmTV(self.relative_tau, variation=variation, **limit)
 
+    def _trained(self) -> AbstractSolver:
+        """The reconstruction of a file; MeasurementError, one line, for one of no use."""
+        try:
+            return _read_trained(self.method, Path(self.method).stat().st_mtime)
+        except FileNotFoundError:
+            text = "is missing; give a file that 'thincam train' wrote, or a method"
+            raise MeasurementError(f"--method {self.method}: {text}") from None
+        except (ValueError, OSError) as error:
+            raise MeasurementError(f"--method {error}") from None
+
     def _check_method(self) -> None:
         """Whether it is one, works from prepared captures, and uses what is given."""
         if self.focusing is not None:
             for name in ("coupling", "tau", "ridge"):
                 if getattr(self, name) is not None:
                     raise MeasurementError(f"--network has no {name}; leave one of both out")
+            return
+        if is_trained(self.method):
+            for name in ("coupling", "tau", "ridge", "iterations"):
+                if getattr(self, name) is not None:
+                    raise MeasurementError(f"a trained reconstruction has no {name}; leave it out")
+            self._trained()
             return
         able = f"choose one of {', '.join(repr(m) for m in PSF_METHODS)}"
         if self.method in ("wiener", "fringe_scanning"):

@@ -16,7 +16,7 @@ from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.jobs import Inputs, Job, write_job
-from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources
+from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources, is_trained
 from thincam_jax.commands.terminal import (
     INTERRUPTED,
     WRONG_INPUT,
@@ -31,7 +31,7 @@ from thincam_jax.measured.write import LINEAR, linear_bytes
 from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.reconstruction.depth.find import depth_of_colours
 from thincam_jax.reconstruction.iterate import Progress
-from thincam_jax.reconstruction.methods import choose_solver
+from thincam_jax.reconstruction.methods import AbstractRegularised, choose_solver
 from thincam_jax.reconstruction.other_psf import RESIZE, TURN
 from thincam_jax.reconstruction.psf_check import blocks_blur, check_psf
 from thincam_jax.reconstruction.refinement import changed_psf, refine
@@ -205,7 +205,8 @@ def _reconstruct(
     """The image, unturned; its record is of the method alone."""
     solver = recipe.solver(len(ready.capture))
     # Conjugate gradients are one compiled program, without progress.
-    callback = None if report is None or recipe.is_ridge else partial(report, job.name)
+    in_one_piece = recipe.is_ridge or is_trained(recipe.method)
+    callback = None if report is None or in_one_piece else partial(report, job.name)
     done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
     found = done.found
     if found.status == "non_finite" and recipe.method == "pnp":
@@ -260,7 +261,7 @@ def _doubts(job: Job, ready: Prepared, done: PreparedResult) -> Iterator[Finding
 
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
-    problem, has_tau = done.problem, recipe.method not in ("ridge", "pnp")
+    problem, has_tau = done.problem, isinstance(done.solver, AbstractRegularised)
     prior = problem.regulariser
     assert isinstance(prior, TotalVariation)
     return asdict(done.facts) | {

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 def train(
     config: Annotated[
-        Path, typer.Argument(help="Experiment file (YAML) of kind 'learned' or 'denoiser'.")
+        Path,
+        typer.Argument(help="Experiment file (YAML) of kind 'learned', 'denoiser' or 'trained'."),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results. Default: runs/NAME.")
@@ -24,7 +25,7 @@ def train(
     set_: Overrides = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Train a refocusing network or a denoiser.
+    """Train a refocusing network, a denoiser or a reconstruction.
 
     Writes network.thincam, figures and training.json. Ctrl-C, or a power cut, loses what was done
     since the last check; --resume goes on from there, to the same numbers.
