@@ -114,7 +114,8 @@ class Imperfections:
         electrons = math.exp(rng.uniform(*np.log(self.electrons)))
         counted = rng.poisson(np.maximum(light, 0) * (electrons / full))
         counted = counted + self.read * rng.standard_normal(light.shape)
-        counted[:, rng.random(light.shape[1:]) < self.hot] = electrons * rng.uniform(0.5, 1)
+        hot = rng.random(light.shape[1:]) < self.hot
+        counted[:, hot] = electrons * rng.uniform(0.5, 1, int(hot.sum()))
         # A black level keeps the noise of dark pixels; it is known, and subtracted.
         most = 2 ** int(rng.integers(self.bits, 13)) - 1
         black = 0.02

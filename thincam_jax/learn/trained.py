@@ -21,7 +21,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -44,7 +44,6 @@ from thincam_jax.learn.checkpoint import (
 )
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.reconstruction.imaging_model import Psfs
-from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.outside_light import pinned
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one, residuals
@@ -137,7 +136,7 @@ def refined(
 @eqx.filter_jit
 def prepared(
     physics: PhysicsStep, problem: InverseProblem, image: Image
-) -> tuple[Float[Array, "2 *batch channel y x"], Float[Array, "*batch 1 1 1"]]:
+) -> tuple[Float[Array, "2 *batch channel v u"], Float[Array, "*batch 1 1 1"]]:
     """Both images in front of the sensor, in their unit, the network's white; and that unit."""
     sensor = _seen(problem)
     both = refined(problem, image, physics.noise), image[..., 0, :, :]
@@ -189,7 +188,7 @@ class CameraPortrait(eqx.Module):
     image: Float[Array, "v u"]
 
     @classmethod
-    def of(cls, psf: Float[np.ndarray, "*colour k l"]) -> Self:
+    def of(cls, psf: Float[np.ndarray, "*colour k l"]) -> "CameraPortrait":
         """Portrait of a measured or computed PSF; colours are added up."""
         numbers = np.asarray(psf, np.float32)
         total = numbers.reshape(-1, *numbers.shape[-2:]).sum(axis=0)
@@ -254,7 +253,7 @@ class TrainedReconstruction(AbstractSolver):
     @classmethod
     def create(
         cls, options: TrainedOptions, psf: Float[np.ndarray, "*colour k l"], *, key: Key
-    ) -> Self:
+    ) -> "TrainedReconstruction":
         """An untrained one for the camera of a PSF, whose network adds nothing."""
         colours = psf.shape[0] if psf.ndim > 2 else 1
         noise, together = jnp.full(colours, np.log(0.1), jnp.float32), options.colours
@@ -273,9 +272,12 @@ class TrainedReconstruction(AbstractSolver):
         began, doubt = time.perf_counter(), self._checked(recording)
         problem, first = self.physics(recording)
         image = jax.block_until_ready(_completed(self.physics, self.network, problem, first))
-        outcome = Outcome(image[..., None, :, :], "ok", (), 0, time.perf_counter() - began)
-        found = recording.reconstruction(outcome, self.name)
-        return dataclasses.replace(found, reason=doubt)
+        field = getattr(recording.imaging_model, "field_shape", None)
+        if field is not None:
+            sides = zip(field, image.shape[-2:], strict=True)
+            image = centred_crop(image, [min(pair) for pair in sides])
+        image, seconds = recording.shaped(image[..., None, :, :]), time.perf_counter() - began
+        return Reconstruction(image, None, self.name, reason=doubt, seconds=seconds)
 
     def check_camera(self, psf: Float[np.ndarray, "*colour k l"]) -> str:
         """A sentence where a PSF may be another camera's than that of the training, else nothing.

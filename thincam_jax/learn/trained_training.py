@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.learn.refocusing.sources import Entry, as_json
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.learn.trained import PhysicsStep, TrainedReconstruction, cleaned, refined
-from thincam_jax.learn.trained_lessons import CameraLessons, Examples
+from thincam_jax.learn.trained_lessons import CameraLessons, Examples, PairLessons
 from thincam_jax.learn.training import (
     Task,
     Trained,
@@ -46,10 +46,7 @@ _SCORED = 8  # captures whose whole images are scored at the end
 _NOISES = np.log(10.0) * np.arange(-3.0, 3.1, 0.5)  # ln λ that are tried
 
 
-class ExampleSource(Protocol):
-    """Examples by seed and count: `CameraLessons` or `PairLessons`."""
-
-    def examples(self, physics: PhysicsStep, seed: int, count: int) -> Examples: ...
+ExampleSource = CameraLessons | PairLessons
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +196,8 @@ def train_reconstruction(
             state = read_state(path, begun, settings)
         keep = functools.partial(_keep, path, made, settings, record)
     trained = train_model(task, made.network, options, state=state, keep=keep, callback=callback)
-    whole_model = dataclasses.replace(made, network=trained.model)
+    # The arrays of a state that was read are NumPy's.
+    whole_model = dataclasses.replace(made, network=jax.tree.map(jnp.asarray, trained.model))
     return Trained(whole_model, trained.state, trained.status)
 
 

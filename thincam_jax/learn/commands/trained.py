@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from thincam_jax._core.quantity import FieldError
 from thincam_jax._core.table import Table
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.evaluate.config import EvaluationConfig
@@ -24,6 +25,7 @@ from thincam_jax.learn.commands.training import TRAINING, Ended, InFolder, Learn
 from thincam_jax.learn.denoiser.pictures import Pictures, split, united
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.plot import draw_losses
+from thincam_jax.learn.refocusing.learned import finite
 from thincam_jax.learn.refocusing.sources import as_json
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction
@@ -112,8 +114,11 @@ def run_trained(config: TrainedConfig, place: InFolder) -> Ended:
         "kind": config.kind,
         "status": done.status,
         **state.counts,
-        "scores": [None if score != score else round(float(score), 5) for score in state.scores],
-        "psnr_db": {"physics": [b for b, _ in rows], "trained": [a for _, a in rows]},
+        "scores": [finite(score) for score in state.scores],
+        "psnr_db": {
+            "physics": [finite(before) for before, _ in rows],
+            "trained": [finite(after) for _, after in rows],
+        },
         "learned_numbers": parameter_count(done.model),
         "images": as_json(lessons.images),
         "network": NETWORK,
@@ -164,7 +169,11 @@ def build_lessons(config: TrainedConfig) -> ReconstructionLessons:
     if config.pairs is not None:
         parts["train"], parts["judge"] = _pairs(config)
     lessons = {"camera": made[0], "images": images, **parts}
-    return config.training.build(ReconstructionLessons, **lessons)
+    try:
+        return config.training.build(ReconstructionLessons, **lessons)
+    except FieldError as error:
+        place = config.place_of("training", error.field)
+        raise ConfigError(f"{place}training.{error}") from None
 
 
 def _pictures(config: TrainedConfig) -> tuple[list[Pictures], list[Pictures]]:

@@ -1,0 +1,122 @@
+"""`thincam train` of a reconstruction, and its file as a method of the commands."""
+
+import json
+
+import numpy as np
+import pytest
+from learn.commands.test_train import call, line
+from learn.test_trained import drawn_psf
+from learn.test_trained_training import pictures
+from typer.testing import CliRunner
+
+from thincam_jax.commands import cli
+from thincam_jax.learn.trained import TrainedReconstruction, training_record
+from thincam_jax.learn.trained_lessons import CameraLessons
+from thincam_jax.learn.trained_training import NETWORK, STATE
+
+FILE = """
+name: tiny
+kind: trained
+psf: {path: psf.npy, background: 0.0}
+sources:
+  - {name: drawn, kind: drawn, count: 2}
+network: {iterations: 5, widths: [4]}
+training: {steps: 4, pool: 2, fitted: 1, batch: 2, crop: 16, judged: 1, check_every: 2, warm_up: 1}
+"""
+PSF = drawn_psf(0, (24, 32))
+
+
+@pytest.fixture
+def file(tmp_path):
+    np.save(tmp_path / "psf.npy", PSF[0])
+    path = tmp_path / "tiny.yaml"
+    path.write_text(FILE, "utf-8")
+    return path
+
+
+def trained_file(folder, psf=PSF):
+    """An untrained reconstruction's file, that of a network of the camera."""
+    from thincam_jax.learn.trained import TrainedOptions
+
+    made = TrainedReconstruction.create(TrainedOptions(iterations=5, widths=(4,)), psf, key=0)
+    return made.save(folder / "mine.thincam")
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+
+
+@pytest.mark.thorough
+def test_a_training_is_told_and_gone_on_with(file, tmp_path):
+    out = tmp_path / "out"
+    done = call(file, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "finished: " in done.stdout and "to its physics step" in done.stdout
+    result = json.loads((out / "training.json").read_text("utf-8"))
+    assert result["steps"] == 4 and len(result["scores"]) == 2
+    assert len(result["psnr_db"]["trained"]) == 1
+    record = training_record(out / NETWORK)
+    assert record["images"]["trained on"][0]["licence"] == "drawn"
+    assert record["faults"]["scale"] == 0.02 and record["sensor"] == [24, 32]
+    assert "give --resume to go on with it" in line(call(file, "--out", out))
+    assert call(file, "--out", out, "--resume").exit_code == 0
+    state = out / STATE
+    state.write_bytes(state.read_bytes()[:-1])
+    assert "is damaged or cut off" in line(call(file, "--out", out, "--resume"))
+    # Its numbers are the start of a training on pairs, of the same size.
+    for folder in ("captures", "truths"):
+        (tmp_path / "pairs" / folder).mkdir(parents=True)
+    for number in range(3):
+        recording, scene = CameraLessons(PSF, (24, 32), pictures()).drawn(0, number)
+        light = np.asarray(recording.captures[0])[0].astype(np.float32)
+        np.save(tmp_path / "pairs/captures" / f"{number}.npy", light)
+        np.save(tmp_path / "pairs/truths" / f"{number}.npy", scene[0, 11:35, 15:47])
+    more = "--set", "pairs={path: pairs, judged: 1}", "--set", f"start={out / NETWORK}"
+    tuned = call(file, "--out", tmp_path / "b", *more)
+    assert tuned.exit_code == 0, tuned.output
+    other = line(call(file, "--out", tmp_path / "c", *more, "--set", "network.widths=[6]"))
+    assert "give these in the section network" in other
+
+
+def test_what_cannot_be_used_is_told(file, tmp_path):
+    def told(*settings):
+        options = [word for one in settings for word in ("--set", one)]
+        return line(call(file, "--out", tmp_path / "out", *options))
+
+    assert "psf: " in told("psf.path=no.npy") and "no.npy" in told("psf.path=no.npy")
+    assert "crop = 30: give at most 24, the sensor's side" in told("training.crop=30")
+    missing = tmp_path / "no.thincam"
+    assert f"start: {missing}: is missing; give a network's file" in told(f"start={missing}")
+    other = trained_file(tmp_path, drawn_psf(8, (24, 32)))
+    same = "network={iterations: 5, widths: [4]}"
+    assert "it is another camera" in told(f"start={other}", same)
+    assert "give the fewest first" in told("faults.electrons=[9, 3]")
+
+
+def test_its_file_is_a_method_of_the_commands(tmp_path):
+    np.save(tmp_path / "psf.npy", PSF[0])
+    path, data = trained_file(tmp_path), tmp_path / "data"
+    for folder in ("captures", "truths"):
+        (data / folder).mkdir(parents=True)
+        light = 100 + 900 * np.random.default_rng(0).random((24, 32)).astype(np.float32)
+        np.save(data / folder / "a.npy", light)
+    files = "--psf", tmp_path / "psf.npy", "--background", "0"
+    capture = "--capture", data / "captures/a.npy", "--out", tmp_path / "image.npy"
+    done = run("reconstruct", *files, *capture, "--method", path)
+    assert done.exit_code == 0, done.output
+    assert np.load(tmp_path / "image.npy").shape[-2:] == (24, 32)
+    record = json.loads((tmp_path / "image.json").read_text("utf-8"))
+    assert record["reconstruction"]["method"] == "trained"
+    assert record["reconstruction"]["tau"] is None
+    told = line(run("reconstruct", *files, *capture, "--method", path, "--tau", "2"))
+    assert told == "a trained reconstruction has no tau; leave it out"
+    told = line(run("reconstruct", *files, *capture, "--method", tmp_path / "no.thincam"))
+    assert "no.thincam: is missing; give a file that 'thincam train' wrote" in told
+    compared = run("evaluate", data, *files, "--method", path, "--method", "ridge", "--out",
+                   tmp_path / "scores", "--workers", "1")  # fmt: skip
+    assert compared.exit_code == 0, compared.output
+    table = (tmp_path / "scores/table.csv").read_text("utf-8")
+    assert "0,a,mine," in table and "0,a,ridge," in table
+    path.write_bytes(path.read_bytes()[:-1])
+    told = line(run("evaluate", data, *files, "--method", path))
+    assert "is damaged or cut off" in told
