@@ -1,5 +1,7 @@
 """Faults of simulated captures: each changes what it says, by as much as it says."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -39,7 +41,7 @@ def moments(psf):
 
 
 def drawn(count=40, **changes):
-    faults = Imperfections(**{**vars(NONE), **changes})
+    faults = dataclasses.replace(NONE, **changes)
     return [faults.psf(spots(), np.random.default_rng(n)) for n in range(count)]
 
 
@@ -73,7 +75,7 @@ def test_light_without_faults_is_what_the_sensor_counts():
 def test_added_light_is_at_most_as_much_as_it_says(name):
     light = np.zeros((1, 24, 36), np.float32)
     light[0, 12, 18] = 2.0
-    faults = Imperfections(**{**vars(NONE), name: 0.2})
+    faults = dataclasses.replace(NONE, **{name: 0.2})
     added = [faults.exposed(light, np.random.default_rng(n))[0, :10] for n in range(30)]
     highest = np.asarray([one.max() for one in added])
     assert 0.2 < highest.max() < 0.41 and highest.min() < 0.1
@@ -83,16 +85,16 @@ def test_added_light_is_at_most_as_much_as_it_says(name):
 
 def test_noise_hot_and_saturated_pixels():
     flat = np.full((1, 60, 80), 1.0, np.float32)
-    noisy = Imperfections(**{**vars(NONE), "electrons": (400.0, 400.0), "read": 3.0})
+    noisy = dataclasses.replace(NONE, electrons=(400.0, 400.0), read=3.0)
     seen = [noisy.exposed(flat, np.random.default_rng(n)) for n in range(6)]
     # A full pixel has 400 electrons, these 0.5 to 0.98 of it: where more come, they are cut off.
     variance = np.asarray([one.var() for one in seen])
     assert (0.9 / 400 < variance).all() and (variance < (2.0 / 400 + 36 / 400**2) * 1.1).all()
-    hot = Imperfections(**{**vars(NONE), "hot": 0.01}).exposed(0.1 * flat, np.random.default_rng(0))
+    hot = dataclasses.replace(NONE, hot=0.01).exposed(0.1 * flat, np.random.default_rng(0))
     share = np.mean(np.abs(hot - 0.1) > 0.01)
     assert 0.002 < share < 0.02
     ramp = np.linspace(0, 1, 4800, dtype=np.float32).reshape(1, 60, 80)
-    cut = Imperfections(**{**vars(NONE), "saturated": 0.1})
+    cut = dataclasses.replace(NONE, saturated=0.1)
     shares = [np.mean(one == one.max()) for one in
               (cut.exposed(ramp, np.random.default_rng(n)) for n in range(20))]  # fmt: skip
     assert 0.05 < max(shares) < 0.11 and min(shares) < 0.01
@@ -105,7 +107,7 @@ def test_a_capture_is_that_of_the_true_psf():
     seen = NONE.capture(operator, spots(), scene, np.random.default_rng(0))
     exact = np.asarray(operator(jnp.asarray(scene)[:, None]))
     np.testing.assert_allclose(seen, exact, atol=2e-3 * exact.max())
-    faults = Imperfections(**{**vars(NONE), "turn": 5.0})
+    faults = dataclasses.replace(NONE, turn=5.0)
     assert (
         np.abs(faults.capture(operator, spots(), scene, np.random.default_rng(0)) - exact).max()
         > 0.05

@@ -139,11 +139,12 @@ def test_its_derivative_is_that_of_finite_differences(model):
 
     @eqx.filter_jit
     def value(parts):
-        return jnp.sum(weight * completed(*parts, problem, image))
+        physics, network = parts
+        return jnp.sum(weight * completed(physics, network, problem, image))
 
     slope = eqx.filter_grad(value)(parts)
-    key = iter(jax.random.split(jax.random.key(5), 100))
-    way = jax.tree.map(lambda x: jax.random.normal(next(key), x.shape, x.dtype), parts)
+    rng = np.random.default_rng(5)
+    way = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), parts)
     exact = sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (slope, way)), strict=True))
 
     def moved(step):
@@ -191,7 +192,8 @@ def test_a_file_holds_all_and_is_read_whole_or_not_at_all(model, tmp_path):
     model.save(path, {"scores": [0.25]})
     assert training_record(path) == {"scores": [0.25]}
     read = TrainedReconstruction.load(path)
-    assert read.options == OPTIONS and read.camera.digest == model.camera.digest
+    assert read.options == OPTIONS and read.camera is not None
+    assert read.camera.digest == model.camera.digest
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), model)
     assert eqx.tree_equal(read, single)
     recording, _ = recorded()

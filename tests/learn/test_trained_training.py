@@ -76,7 +76,7 @@ def test_scenes_are_those_of_their_seed_and_fill_what_they_say():
 
 def test_an_example_is_an_image_of_its_scene():
     physics = untrained().physics
-    exact = Imperfections(**vars(NONE) | {"electrons": (1e6, 1e6)})
+    exact = dataclasses.replace(NONE, electrons=(1e6, 1e6))
     camera = dataclasses.replace(CAMERA, faults=exact)
     drawn = camera.examples(physics, 0, 3)
     assert drawn.images.shape == (3, 2, 1, *SENSOR) and drawn.truth.shape == (3, 1, *SENSOR)

@@ -35,6 +35,7 @@ from thincam_jax._core.precision import AccuracyWarning, as_complex, squared_mod
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax._core.random import Key, random_key
 from thincam_jax._core.text import of_error
+from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import centred_crop, cut, place
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
@@ -104,23 +105,30 @@ class PhysicsStep(eqx.Module):
 
 def with_whole_field(recording: Recording) -> Recording:
     """The recording whose image is not only the part in front of the sensor."""
-    model = recording.imaging_model
-    if not isinstance(model, Psfs) or len(recording.captures) > 1 or model.psfs.shape[2] > 1:
+    model, captures = recording.imaging_model, recording.captures
+    if not isinstance(model, Psfs) or model.count > 1 or model.psfs.shape[2] > 1:
         raise ValueError(
             "a trained reconstruction takes one capture by a measured PSF; give a recording with "
             "tc.Psfs of one PSF"
         )
-    sizes = zip(recording.captures[0].shape[-2:], model.psfs.shape[-2:], strict=True)
+    sizes = zip(captures[0].shape[-2:], model.psfs.shape[-2:], strict=True)
     rows, columns = (n + k - 1 for n, k in sizes)
     model = Psfs(model.psfs, field_shape=(rows, columns))
     return eqx.tree_at(lambda one: one.imaging_model, recording, model)
+
+
+def operator_of(problem: InverseProblem) -> CropConvolution:
+    """The convolution of the only capture."""
+    operators = convolutions(problem)
+    assert operators is not None  # of measured PSFs
+    return operators[0]
 
 
 def refined(
     problem: InverseProblem, image: Image, noise: Float[Array, " colour"]
 ) -> Float[Array, "*batch channel y x"]:
     """The image with the Wiener filter of its residual."""
-    (operator,) = convolutions(problem) or ()
+    operator = operator_of(problem)
     (missing,), (weight,) = residuals(problem, image), problem.weights
     spectrum = operator.spectrum[..., 0, :, :]
     power = squared_modulus(spectrum)

@@ -18,11 +18,10 @@ from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.learn.denoiser.pictures import Pictures
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.refocusing.sources import Entry, dead_leaves, read_photographs, read_samples
-from thincam_jax.learn.trained import PhysicsStep, prepared, with_whole_field
+from thincam_jax.learn.trained import PhysicsStep, operator_of, prepared, with_whole_field
 from thincam_jax.measured.pairs import PairedCapture, Pairs
 from thincam_jax.measured.preparation import Prepared
 from thincam_jax.reconstruction.imaging_model import Psfs
-from thincam_jax.reconstruction.problem import convolutions
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.studies.prepared import pixel_noise, prepared_recording
 
@@ -123,7 +122,7 @@ class CameraLessons:
         """A recording and its scene, in the whole field, by seed and number alone."""
         rng, colours = np.random.default_rng((seed, number)), len(self.psf)
         blank = np.ones((1, colours, *self.sensor), np.float32)
-        (operator,) = convolutions(with_whole_field(self.recorded(blank)).problem()) or ()
+        operator = operator_of(with_whole_field(self.recorded(blank)).problem())
         sizes = colours, self.sensor, operator.field_shape
         scene = draw_scene(self.pictures.tiles, *sizes, rng)
         return self.recorded(self.faults.capture(operator, self.psf, scene, rng)[None]), scene

@@ -1,0 +1,123 @@
+"""A reconstruction trained for your camera
+=========================================
+
+A lensless camera is known by its PSF. Photographs behind the exact model, with the faults that real
+captures have, teach a small network what total variation leaves: no real capture is needed. Here
+this is done for a diffuser whose PSF is drawn, and judged on captures whose faults nobody tells.
+"""
+
+import logging
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import thincam_jax as tc
+from thincam_jax.imaging.operators.crop_convolution import centred_crop
+from thincam_jax.learn.denoiser.pictures import united
+from thincam_jax.learn.denoiser.reconstructions import drawn_kernels
+from thincam_jax.learn.imperfections import Imperfections
+from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction
+from thincam_jax.learn.trained_lessons import CameraLessons, drawn, photographs
+from thincam_jax.learn.trained_training import ReconstructionLessons, train_reconstruction
+from thincam_jax.learn.training import TrainingOptions
+from thincam_jax.studies.agreement import agreement
+
+SMALL = os.environ.get("THINCAM_SIZE") == "small"
+FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "trained_reconstruction"
+FIGURES.mkdir(parents=True, exist_ok=True)
+PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
+logging.getLogger("thincam_jax").setLevel(logging.ERROR)  # hot pixels of every drawn capture
+
+# %%
+# Camera and pictures
+# -------------------
+#
+# All that is known of the camera is its PSF: with yours, `measured.prepare` and
+# `experiments/real_capture.py` read the file. A few photographs are held out.
+
+SENSOR = (36, 44) if SMALL else (96, 128)
+if SMALL or not PHOTOGRAPHS.is_dir():
+    train, unseen = drawn(0, 4), drawn(1, 2)
+else:
+    named = photographs(PHOTOGRAPHS / "cc0")
+    names = sorted(named)
+    train = united([*(named[n] for n in names[5:]), drawn(0, 20)])
+    unseen = united([named[n] for n in names[:5]])
+rng = np.random.default_rng(3)
+side = max(SENSOR)
+square = drawn_kernels(rng, side, 0.7 * side, 1)[0]
+top, left = ((side - n) // 2 for n in SENSOR)
+psf = square[None, top : top + SENSOR[0], left : left + SENSOR[1]]
+psf = (psf / psf.sum()).astype(np.float32)
+
+# %%
+# Training
+# --------
+#
+# Each capture has a PSF of its own, up to 2 % larger or smaller than the one we know, turned and
+# blurred, light that is not the scene's, saturated and hot pixels, and noise.
+
+faults = Imperfections()
+camera = CameraLessons(psf, SENSOR, train, faults)
+held_out = replace(camera, pictures=unseen)
+amount: dict[str, Any] = {"pool": 150}
+if SMALL:
+    amount = {"fitted": 1, "pool": 3, "judged": 1, "batch": 2, "crop": 24}
+lessons = ReconstructionLessons(camera, judge=held_out, **amount)
+options = TrainingOptions(steps=4 if SMALL else 1500, check_every=2 if SMALL else 150)
+sizes = TrainedOptions(5, (4, 4)) if SMALL else TrainedOptions(widths=(24, 32, 48))
+untrained = TrainedReconstruction.create(sizes, psf, key=0)
+trained = train_reconstruction(untrained, lessons, options).model
+trained.save(FIGURES / "network.thincam")
+
+# %%
+# Captures that it has not seen
+# -----------------------------
+#
+# Gain and offset of each image are fitted, as `thincam evaluate` does.
+
+methods = {"AdmmTV": tc.AdmmTV(), "PlugAndPlay": tc.PlugAndPlay(), "trained": trained}
+if SMALL:
+    del methods["PlugAndPlay"]
+scores = {name: [] for name in methods}
+shown = []
+for number in range(1 if SMALL else 8):
+    recording, scene = held_out.drawn(99, number)
+    truth = np.asarray(centred_crop(jnp.asarray(scene), SENSOR), np.float32)
+    images = {"truth": truth, "capture": np.asarray(recording.captures[0])}
+    for name, method in methods.items():
+        image = np.asarray(tc.reconstruct(recording, method).image, np.float32)
+        found = agreement(image, truth)
+        scores[name].append(found.psnr_db)
+        images[name] = found.image
+    shown.append(images)
+for name, values in scores.items():
+    print(f"{name:12s} {np.mean(values):.2f} dB")
+assert all(np.isfinite(values).all() for values in scores.values())
+
+rows = min(3, len(shown))
+figure, axes = plt.subplots(
+    rows, len(shown[0]), figsize=(2.4 * len(shown[0]), 2 * rows), squeeze=False
+)
+for row, (images, number) in enumerate(zip(shown, range(rows), strict=False)):
+    white = images["truth"].max()
+    for ax, (name, image) in zip(axes[row], images.items(), strict=True):
+        top_level = image.max() if name == "capture" else white
+        ax.imshow(np.clip(image[0] / top_level, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+        score = f", {scores[name][number]:.1f} dB" if name in scores else ""
+        ax.set_title(f"{name}{score}", fontsize=9)
+        ax.set(xticks=[], yticks=[])
+figure.tight_layout()
+figure.savefig(FIGURES / "trained.png", dpi=110)
+
+# %%
+# What it makes up
+# ----------------
+#
+# The network has seen photographs: where a capture tells nothing it draws what photographs have
+# there. It has no measure of trust; compare with `AdmmTV`, which shows noise instead.
