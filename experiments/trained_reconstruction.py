@@ -3,7 +3,7 @@
 
 A lensless camera is known by its PSF. Photographs behind the exact model, with the faults that real
 captures have, teach a small network what total variation leaves: no real capture is needed. Here
-this is done for a diffuser whose PSF is drawn, and judged on captures whose faults nobody tells.
+this is done for a mask of random cells, and judged on captures whose faults nobody tells.
 """
 
 import logging
@@ -12,20 +12,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.imaging.operators.crop_convolution import centred_crop
+from thincam_jax.imaging.metrics import align, psnr
 from thincam_jax.learn.denoiser.pictures import united
-from thincam_jax.learn.denoiser.reconstructions import drawn_kernels
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction
 from thincam_jax.learn.trained_lessons import CameraLessons, drawn, photographs
 from thincam_jax.learn.trained_training import ReconstructionLessons, train_reconstruction
 from thincam_jax.learn.training import TrainingOptions
-from thincam_jax.studies.agreement import agreement
+from thincam_jax.lensless.masks import random_cells
+from thincam_jax.units import nm, um
 
 SMALL = os.environ.get("THINCAM_SIZE") == "small"
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "trained_reconstruction"
@@ -48,12 +47,11 @@ else:
     names = sorted(named)
     train = united([*(named[n] for n in names[5:]), drawn(0, 20)])
     unseen = united([named[n] for n in names[:5]])
-rng = np.random.default_rng(3)
-side = max(SENSOR)
-square = drawn_kernels(rng, side, 0.7 * side, 1)[0]
-top, left = ((side - n) // 2 for n in SENSOR)
-psf = square[None, top : top + SENSOR[0], left : left + SENSOR[1]]
-psf = (psf / psf.sum()).astype(np.float32)
+pitch = (60 if SMALL else 20) * um
+mask = random_cells(0, 1.2, 40 * um, 0.1)
+thin = tc.LenslessCamera(mask, tc.Sensor(SENSOR, pitch), 2.0)
+psf = np.asarray(tc.psf(thin, wavelength=540 * nm, pixel_integration=True), np.float32)[None]
+psf = psf / psf.sum()
 
 # %%
 # Training
@@ -88,13 +86,13 @@ scores = {name: [] for name in methods}
 shown = []
 for number in range(1 if SMALL else 8):
     recording, scene = held_out.drawn(99, number)
-    truth = np.asarray(centred_crop(jnp.asarray(scene), SENSOR), np.float32)
+    top, left = ((n - m) // 2 for n, m in zip(scene.shape[1:], SENSOR, strict=True))
+    truth = scene[:, top : top + SENSOR[0], left : left + SENSOR[1]]
     images = {"truth": truth, "capture": np.asarray(recording.captures[0])}
     for name, method in methods.items():
         image = np.asarray(tc.reconstruct(recording, method).image, np.float32)
-        found = agreement(image, truth)
-        scores[name].append(found.psnr_db)
-        images[name] = found.image
+        scores[name].append(psnr(image[0], truth[0]))
+        images[name] = align(image[0], truth[0])[None]
     shown.append(images)
 for name, values in scores.items():
     print(f"{name:12s} {np.mean(values):.2f} dB")

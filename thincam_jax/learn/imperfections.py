@@ -2,7 +2,7 @@
 
 A network that learns from perfect simulations fails at the first real capture: its PSF is not
 quite that of the file, and the sensor adds what no model has. Each capture is therefore drawn
-with faults of its own, which the reconstruction is not told.
+with faults of its own, which the reconstruction does not know.
 """
 
 import dataclasses
@@ -101,7 +101,7 @@ class Imperfections:
     def exposed(
         self, light: Float[np.ndarray, "channel y x"], rng: np.random.Generator
     ) -> Float32[np.ndarray, "channel y x"]:
-        """What a sensor makes of light: background, saturation, noise and quantisation."""
+        """Capture of light by a sensor: background, saturation, noise and quantisation."""
         largest = max(float(light.max()), 1e-12)
         light = light + largest * self.background * rng.uniform()
         smooth = rng.uniform(0, 1, (len(light), 2, 3))

@@ -55,7 +55,7 @@ def _square(image: np.ndarray, entry: Entry) -> Pictures:
     return Pictures(resize(square, (SIDE, SIDE)).astype(np.float32)[None], (entry,))
 
 
-class Examples(eqx.Module):
+class PreparedExamples(eqx.Module):
     """Input images of the network and truths in front of the sensor, both in the images' unit."""
 
     images: Float[Array, "*example input colour y x"]
@@ -110,7 +110,7 @@ class CameraLessons:
     """Captures of pictures by a camera that is known by its PSF alone, each with its own faults.
 
     - `psf`: measured PSF, (colour, k, l); `sensor`: rows and columns of the captures.
-    - `pictures`: see `draw_scene`. `faults`: those that the reconstruction is not told.
+    - `pictures`: see `draw_scene`. `faults`: those that the reconstruction does not know.
     """
 
     psf: Float32[np.ndarray, "colour k l"]
@@ -131,7 +131,7 @@ class CameraLessons:
         """Captures with the measured PSF, which is wrong by what their faults are."""
         return Recording(captures, Psfs(self.psf[None]))
 
-    def examples(self, physics: PhysicsStep, seed: int, count: int) -> Examples:
+    def examples(self, physics: PhysicsStep, seed: int, count: int) -> PreparedExamples:
         """Input and truth of the network for drawn captures."""
         made = [example(physics, *self.drawn(seed, number)) for number in range(count)]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
@@ -139,11 +139,26 @@ class CameraLessons:
 
 def example(
     physics: PhysicsStep, recording: Recording, scene: Float[np.ndarray, "colour m n"]
-) -> Examples:
+) -> PreparedExamples:
     """Example of one capture; in half precision, as thousands are kept."""
-    images, unit = prepared(physics, *physics(recording))
-    truth = centred_crop(jnp.asarray(scene), images.shape[-2:]) / unit
-    return Examples(images.astype(jnp.float16), truth.astype(jnp.float16))
+    images, _ = prepared(physics, *physics(recording))
+    truth = levelled(np.asarray(centred_crop(jnp.asarray(scene), images.shape[-2:])), images[-1])
+    return PreparedExamples(images.astype(jnp.float16), jnp.asarray(truth, jnp.float16))
+
+
+def levelled(
+    truth: Float[np.ndarray, "colour y x"], image: Float[Array, "colour y x"]
+) -> Float[np.ndarray, "colour y x"]:
+    """Truth with the gain and offset of each colour that bring it closest to an image.
+
+    Uniform light of a scene that fills the field and uniform light beside it look alike in a
+    capture: a network that had to tell them apart would learn little else.
+    """
+    known, seen = (np.asarray(one, float) for one in (truth, image))
+    middle, level = (one.mean(axis=(1, 2), keepdims=True) for one in (known, seen))
+    power = np.sum((known - middle) ** 2, axis=(1, 2), keepdims=True)
+    together = np.sum((known - middle) * (seen - level), axis=(1, 2), keepdims=True)
+    return together / np.maximum(power, 1e-30) * (known - middle) + level
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,19 +174,18 @@ class PairLessons:
     first: int
     most: int
 
-    def examples(self, physics: PhysicsStep, seed: int, count: int) -> Examples:
-        """Input and truth of the network; truths get the gain that fits the physics step best."""
+    def examples(self, physics: PhysicsStep, seed: int, count: int) -> PreparedExamples:
+        """Input and truth of the network; see `levelled`."""
         numbers = range(self.first, self.first + min(count, self.most))
         made = [self._example(physics, self.pairs[number]) for number in numbers]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
 
-    def _example(self, physics: PhysicsStep, pair: PairedCapture) -> Examples:
+    def _example(self, physics: PhysicsStep, pair: PairedCapture) -> PreparedExamples:
         ready = self.ready(pair)
         recording = prepared_recording(ready, pixel_noise(ready))
         images, _ = prepared(physics, *physics(recording))
         aligned = self.pairs.alignment.matched
         matched = [aligned(np.asarray(one), pair.truth, ready.log) for one in images]
         inside, truth = np.stack([one for one, _ in matched]), matched[-1][1]
-        power = np.sum(truth**2, axis=(1, 2), keepdims=True)
-        gain = np.sum(inside[-1] * truth, axis=(1, 2), keepdims=True) / np.maximum(power, 1e-30)
-        return Examples(*(jnp.asarray(one, jnp.float16) for one in (inside, gain * truth)))
+        both = inside, levelled(truth, inside[-1])
+        return PreparedExamples(*(jnp.asarray(one, jnp.float16) for one in both))

@@ -24,7 +24,7 @@ from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.learn.refocusing.sources import Entry, as_json
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.learn.trained import PhysicsStep, TrainedReconstruction, cleaned, refined
-from thincam_jax.learn.trained_lessons import CameraLessons, Examples, PairLessons
+from thincam_jax.learn.trained_lessons import CameraLessons, PairLessons, PreparedExamples
 from thincam_jax.learn.training import (
     Task,
     Trained,
@@ -115,7 +115,7 @@ def _error(problem: InverseProblem, image: Image, level, truth) -> Float[Array, 
     return 1 - jnp.sum(change * error, axis=(1, 2)) ** 2 / (or_one(size) * or_one(power))
 
 
-def loss(network: UNet, given: Examples) -> tuple[Float[Array, ""], dict[str, Array]]:
+def loss(network: UNet, given: PreparedExamples) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Mean absolute error of crops, in parts of a capture's white; and the last input's."""
     images, truth = (leaf.astype(jnp.float32) for leaf in (given.images, given.truth))
     inputs = jnp.moveaxis(images, 1, 0)
@@ -124,7 +124,7 @@ def loss(network: UNet, given: Examples) -> tuple[Float[Array, ""], dict[str, Ar
     return after, {"before": before}
 
 
-def _drawn(pool: Examples, batch: int, crop: int, key: PRNGKeyArray) -> Examples:
+def _drawn(pool: PreparedExamples, batch: int, crop: int, key: PRNGKeyArray) -> PreparedExamples:
     """Crops of the pool; where several devices are there, each holds its part of them."""
     crops = _crops(pool, batch, crop, key)
     devices = jax.devices()
@@ -136,7 +136,7 @@ def _drawn(pool: Examples, batch: int, crop: int, key: PRNGKeyArray) -> Examples
 
 
 @eqx.filter_jit
-def _crops(pool: Examples, batch: int, crop: int, key: PRNGKeyArray) -> Examples:
+def _crops(pool: PreparedExamples, batch: int, crop: int, key: PRNGKeyArray) -> PreparedExamples:
     """Crops at random places, turned and mirrored."""
     chosen, places, turns = jax.random.split(key, 3)
     count, *_, rows, columns = pool.truth.shape
