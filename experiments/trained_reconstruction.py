@@ -48,7 +48,7 @@ else:
     train = united([*(named[n] for n in names[5:]), drawn(0, 20)])
     unseen = united([named[n] for n in names[:5]])
 pitch = (60 if SMALL else 20) * um
-mask = random_cells(0, 1.2, 40 * um, 0.1)
+mask = random_cells(0, 1.2, 40 * um, open_fraction=0.1)
 thin = tc.LenslessCamera(mask, tc.Sensor(SENSOR, pitch), 2.0)
 psf = np.asarray(tc.psf(thin, wavelength=540 * nm, pixel_integration=True), np.float32)[None]
 psf = psf / psf.sum()
@@ -63,11 +63,11 @@ psf = psf / psf.sum()
 faults = Imperfections()
 camera = CameraLessons(psf, SENSOR, train, faults)
 held_out = replace(camera, pictures=unseen)
-amount: dict[str, Any] = {"pool": 150}
+amount: dict[str, Any] = {"pool": 80}
 if SMALL:
     amount = {"fitted": 1, "pool": 3, "judged": 1, "batch": 2, "crop": 24}
 lessons = ReconstructionLessons(camera, judge=held_out, **amount)
-options = TrainingOptions(steps=4 if SMALL else 1500, check_every=2 if SMALL else 150)
+options = TrainingOptions(4 if SMALL else 800, 4e-4, check_every=2 if SMALL else 100)
 sizes = TrainedOptions(5, (4, 4)) if SMALL else TrainedOptions(widths=(24, 32, 48))
 untrained = TrainedReconstruction.create(sizes, psf, key=0)
 trained = train_reconstruction(untrained, lessons, options).model
@@ -84,7 +84,7 @@ if SMALL:
     del methods["PlugAndPlay"]
 scores = {name: [] for name in methods}
 shown = []
-for number in range(1 if SMALL else 8):
+for number in range(1 if SMALL else 6):
     recording, scene = held_out.drawn(99, number)
     top, left = ((n - m) // 2 for n, m in zip(scene.shape[1:], SENSOR, strict=True))
     truth = scene[:, top : top + SENSOR[0], left : left + SENSOR[1]]
@@ -111,7 +111,7 @@ for row, (images, number) in enumerate(zip(shown, range(rows), strict=False)):
         ax.set_title(f"{name}{score}", fontsize=9)
         ax.set(xticks=[], yticks=[])
 figure.tight_layout()
-figure.savefig(FIGURES / "trained.png", dpi=110)
+figure.savefig(FIGURES / "trained_reconstruction.png", dpi=110)
 
 # %%
 # What it makes up

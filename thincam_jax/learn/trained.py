@@ -69,14 +69,14 @@ _WHITE = 99.5  # percentile of an image that is 1 for the network
 class TrainedOptions:
     """Size of the physics step and of the network.
 
-    - `iterations`: iterations of `AdmmTV`.
+    - `iterations`: iterations of `AdmmTV`, at most; 40 are five times as fast and 0.7 dB worse.
     - `widths`: channels of the levels of the `UNet`, from the finest.
     - `colours`: colours that the network sees together: 1 or as many as the captures have.
 
     **Errors**: ValueError for numbers out of range.
     """
 
-    iterations: Annotated[int, whole(1, 1000)] = 40
+    iterations: Annotated[int, whole(1, 1000)] = 100
     widths: Annotated[tuple[int, ...], whole(1, 512, many=True)] = (32, 48, 64, 96)
     colours: Annotated[int, whole(1, 16)] = 1
 

@@ -26,6 +26,9 @@ from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.studies.prepared import pixel_noise, prepared_recording
 
 SIDE = 384  # pixels of a picture
+# Correlation of an image with its truth, from which a network can learn; captures that are drawn at
+# most for one that has it.
+_FOUND, _TRIED = 0.6, 4
 
 
 def photographs(folder: str | os.PathLike[str], *, licence: str = "") -> dict[str, Pictures]:
@@ -132,8 +135,17 @@ class CameraLessons:
         return Recording(captures, Psfs(self.psf[None]))
 
     def examples(self, physics: PhysicsStep, seed: int, count: int) -> PreparedExamples:
-        """Input and truth of the network for drawn captures."""
-        made = [example(physics, *self.drawn(seed, number)) for number in range(count)]
+        """Input and truth of the network for drawn captures in which the physics step finds them.
+
+        From others a network would learn to give a grey image.
+        """
+        made: list[PreparedExamples] = []
+        for number in range(_TRIED * count):
+            one = example(physics, *self.drawn(seed, number))
+            if is_found(one) or _TRIED * count - number <= count - len(made):
+                made.append(one)
+            if len(made) == count:
+                break
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
 
 
@@ -144,6 +156,12 @@ def example(
     images, _ = prepared(physics, *physics(recording))
     truth = levelled(np.asarray(centred_crop(jnp.asarray(scene), images.shape[-2:])), images[-1])
     return PreparedExamples(images.astype(jnp.float16), jnp.asarray(truth, jnp.float16))
+
+
+def is_found(one: PreparedExamples) -> bool:
+    """Whether the last image of an example correlates with its truth."""
+    pair = (np.asarray(part, float).ravel() for part in (one.images[-1], one.truth))
+    return bool(np.corrcoef(*pair)[0, 1] > _FOUND)
 
 
 def levelled(
