@@ -371,6 +371,8 @@ FITS = {
     "search": "design_pitches",
     "train": "design_distances",
     "pareto": "design_pareto",
+    "pairs": "trained",
+    "start": "trained",
     "guide/stis.md: mask": "stis",
 }
 

@@ -154,7 +154,8 @@ def example(
 ) -> PreparedExamples:
     """Example of one capture; in half precision, as thousands are kept."""
     images, _ = prepared(physics, *physics(recording))
-    truth = levelled(np.asarray(centred_crop(jnp.asarray(scene), images.shape[-2:])), images[-1])
+    seen = np.asarray(centred_crop(jnp.asarray(scene), images.shape[-2:]))
+    truth = levelled(seen, np.asarray(images[-1]))
     return PreparedExamples(images.astype(jnp.float16), jnp.asarray(truth, jnp.float16))
 
 
@@ -165,14 +166,14 @@ def is_found(one: PreparedExamples) -> bool:
 
 
 def levelled(
-    truth: Float[np.ndarray, "colour y x"], image: Float[Array, "colour y x"]
+    truth: Float[np.ndarray, "colour y x"], image: Float[np.ndarray, "colour y x"]
 ) -> Float[np.ndarray, "colour y x"]:
     """Truth with the gain and offset of each colour that bring it closest to an image.
 
     Uniform light of a scene that fills the field and uniform light beside it look alike in a
     capture: a network that had to tell them apart would learn little else.
     """
-    known, seen = (np.asarray(one, float) for one in (truth, image))
+    known, seen = truth.astype(float), image.astype(float)
     middle, level = (one.mean(axis=(1, 2), keepdims=True) for one in (known, seen))
     power = np.sum((known - middle) ** 2, axis=(1, 2), keepdims=True)
     together = np.sum((known - middle) * (seen - level), axis=(1, 2), keepdims=True)
