@@ -315,6 +315,7 @@ CARDS = {
     "three_lines": ("three-lines.png", 787, 84, 207),
     "video": ("video.png", 854, 21, 223),
     "when_it_looks_wrong": ("when-it-looks-wrong.png", 47, 826, 258),
+    "trained_reconstruction": ("trained-simulated.png", 1245, 10, 120),
     "your_own_mask": ("own-mask.png", 715, 40, 194),
 }
 

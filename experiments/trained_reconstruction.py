@@ -1,5 +1,5 @@
 """A reconstruction trained for your camera
-=========================================
+========================================
 
 A lensless camera is known by its PSF. Photographs behind the exact model, with the faults that real
 captures have, teach a small network what total variation leaves: no real capture is needed. Here
