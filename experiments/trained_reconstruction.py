@@ -109,9 +109,18 @@ for row, (images, number) in enumerate(zip(shown, range(rows), strict=False)):
         ax.imshow(np.clip(image[0] / top_level, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         score = f", {scores[name][number]:.1f} dB" if name in scores else ""
         ax.set_title(f"{name}{score}", fontsize=9)
-        ax.set(xticks=[], yticks=[])
+        ax.set(xlabel="x, pixels")
+    axes[rows - 1][0].set(ylabel="y, pixels")
 figure.tight_layout()
-figure.savefig(FIGURES / "trained_reconstruction.png", dpi=110)
+figure.savefig(FIGURES / "images.png", dpi=110)
+
+figure, ax = plt.subplots(figsize=(5, 3))
+for name, values in scores.items():
+    ax.plot(range(1, len(values) + 1), values, "o-", label=name)
+ax.set(xlabel="capture", ylabel="PSNR, dB")
+ax.legend(frameon=False)
+figure.tight_layout()
+figure.savefig(FIGURES / "scores.png", dpi=110)
 
 # %%
 # What it makes up

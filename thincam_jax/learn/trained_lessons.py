@@ -161,8 +161,8 @@ def example(
 
 def is_found(one: PreparedExamples) -> bool:
     """Whether the last image of an example correlates with its truth."""
-    pair = (np.asarray(part, float).ravel() for part in (one.images[-1], one.truth))
-    return bool(np.corrcoef(*pair)[0, 1] > _FOUND)
+    seen, known = (np.asarray(part, float).ravel() for part in (one.images[-1], one.truth))
+    return bool(np.corrcoef(seen, known)[0, 1] > _FOUND)
 
 
 def levelled(
