@@ -69,7 +69,7 @@ _WHITE = 99.5  # percentile of an image that is 1 for the network
 class TrainedOptions:
     """Size of the physics step and of the network.
 
-    - `iterations`: iterations of `AdmmTV`, at most; 40 are five times as fast and 0.7 dB worse.
+    - `iterations`: iterations of `AdmmTV`, at most; 40 are twice as fast and 0.8 dB worse.
     - `widths`: channels of the levels of the `UNet`, from the finest.
     - `colours`: colours that the network sees together: 1 or as many as the captures have.
 
