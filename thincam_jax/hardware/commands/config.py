@@ -201,11 +201,12 @@ class CaptureConfig(ExperimentConfig):
     @classmethod
     def _with_photographs(cls, given: Any):
         """The file with a target for each photograph: a resolved file names them."""
-        if not isinstance(given, dict) or not (folder := given.get("photographs")):
+        folder = given.get("photographs") if isinstance(given, dict) else None
+        if not folder or not isinstance(folder, str):
             return given
         try:
             files = photograph_files(folder)
-        except (ValueError, TypeError) as error:
+        except ValueError as error:
             raise FieldError(str(error), "photographs") from None
         found = [{"name": slug(one.stem), "kind": "file", "path": str(one)} for one in files]
         return {**given, "targets": [*given.get("targets", ()), *found], "photographs": None}

@@ -56,7 +56,7 @@ class PsfConfig(Section):
     """Measured PSF, and how it and the captures are prepared: see `thincam reconstruct`."""
 
     path: str
-    background: float | Literal["found", "corner"] | None = None
+    background: float | None = None
     bits: int | None = None
     preparation: Preparation = Preparation()
 
