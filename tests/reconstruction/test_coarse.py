@@ -106,8 +106,12 @@ def test_some_30_iterations_after_coarse_ones_do_what_1000_do(dark):
     assert tc.reconstruct(recording, short).history[-1].objective - lowest < (begun - lowest) / 3
 
 
-def test_smooth_misfit_does_not_end_the_iterations_at_the_coarse_image():
-    """2 % of shading, a zone aperture's strong uniform light: the objective rises at first."""
+@pytest.mark.parametrize("exactly", [False, pytest.param(True, marks=pytest.mark.thorough)])
+def test_smooth_misfit_does_not_end_the_iterations_at_the_coarse_image(exactly):
+    """2 % of shading, a zone aperture's strong uniform light: the objective rises at first.
+
+    The coarse image's is 0.7 % above the lowest, which a long run from any image finds.
+    """
     picture = resize(skimage.img_as_float(skimage.data.camera()), (96, 98))
     camera = tc.LenslessCamera(
         tc.FresnelZoneAperture(25.0, width=5.6), tc.Sensor((192, 196), 0.029), 6.5
@@ -121,11 +125,10 @@ def test_smooth_misfit_does_not_end_the_iterations_at_the_coarse_image():
     recording = tc.Recording([light * (1 + shading) + noise], optics)
     result = tc.reconstruct(recording, tc.AdmmTV())
     first, *objectives = [p.objective for p in result.history]
-    assert result.status == "converged" and max(objectives) > first
-    # The coarse image's is 0.7 % above the lowest, which a long run from any image finds.
-    grey = jnp.full(result.image.shape, 0.5)
-    exact = tc.reconstruct(recording, tc.AdmmTV(iterations=400, tolerance=1e-7), start=grey)
-    lowest = min(p.objective for p in exact.history)
-    assert first > 1.005 * lowest and min(objectives) < 1.001 * lowest
+    assert result.status == "converged" and max(objectives) > first > 1.005 * min(objectives)
+    if exactly:
+        grey = jnp.full(result.image.shape, 0.5)
+        exact = tc.reconstruct(recording, tc.AdmmTV(iterations=400, tolerance=1e-7), start=grey)
+        assert min(objectives) < 1.001 * min(p.objective for p in exact.history)
     short = tc.reconstruct(recording, tc.AdmmTV(iterations=20))  # it rises at the last one
     assert short.status == "iterations_exhausted" and short.iterations == 20
