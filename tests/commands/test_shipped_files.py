@@ -82,7 +82,8 @@ def options_of(path, folder):
     if path.stem == "denoiser":
         return ["--set", "sources=[{name: drawn, kind: drawn, count: 2}]"]
     if path.stem == "trained":
-        np.save(folder / "psf.npy", np.random.default_rng(0).random((800, 960)))
+        psf = np.pad(np.random.default_rng(0).random((500, 600)), ((150,), (180,)))
+        np.save(folder / "psf.npy", psf)
         sources = "sources=[{name: drawn, kind: drawn, count: 2}]"
         return ["--set", sources, "--set", f"psf.path={folder / 'psf.npy'}"]
     if path.stem == "rig_pairs":
