@@ -83,12 +83,12 @@ def errors(count: int, seed: int) -> np.ndarray:
 
 @pytest.mark.thorough
 def test_predictions_hold_over_random_cameras():
-    """Of 200 with the seed 20261 all are covered, and 88 % within a factor of ten."""
+    """None of these 24 needs its own PSFs; 13 of 40 in `benchmarks/test_field_plans.py` do."""
     found = errors(24, seed=1)
     _, predicted, true, choice, met = found.T
     assert np.mean(true <= predicted) > 0.95
     assert np.mean(predicted <= 10 * true) > 0.7
-    assert met.all() and set(choice) == {0, 1, 2}
+    assert met.all() and set(choice) == {0, 1}
 
 
 @pytest.mark.thorough
