@@ -21,11 +21,11 @@ _is_watched = contextvars.ContextVar("is_watched", default=False)
 def watched(what: str) -> Iterator[Callable[..., None]]:
     """Show `what` goes on while it does; also a decorator.
 
-    Yields a function of the step done and the most that there can be, and of what is known so far,
-    which is shown in their place. Nothing is shown of what takes less than a second, or within
-    another watched call. At a terminal the line is written to
-    stderr, in a notebook below its cell, and goes at the end; elsewhere it is logged every ten
-    seconds, as information. THINCAM_PROGRESS=off in the environment ends it.
+    Yields a function of the step done and of all steps; words of what is known so far are shown
+    in their place. Nothing is shown of what takes less than a second, or within another watched
+    call. At a terminal the line is written to stderr, in a notebook below its cell, and goes at the
+    end; elsewhere it is logged every ten seconds, as information. THINCAM_PROGRESS=off in the
+    environment ends it.
     """
     if _is_watched.get() or os.environ.get("THINCAM_PROGRESS") == "off":
         yield lambda step, most, said="": None

@@ -4,7 +4,6 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32
 
-from thincam_jax.imaging.encoding import decode_srgb
 from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.imaging.targets import middle_square, resize
+from thincam_jax.learn.denoiser import pictures
 from thincam_jax.learn.denoiser.pictures import Pictures
 from thincam_jax.learn.imperfections import Imperfections
-from thincam_jax.learn.refocusing.sources import Entry, dead_leaves, read_photographs, read_samples
+from thincam_jax.learn.refocusing.sources import Entry, dead_leaves
 from thincam_jax.learn.trained import PhysicsStep, operator_of, prepared, with_whole_field
 from thincam_jax.measured.pairs import PairedCapture, Pairs
 from thincam_jax.measured.preparation import Prepared
@@ -33,15 +32,12 @@ _FOUND, _TRIED = 0.6, 4
 
 def photographs(folder: str | os.PathLike[str], *, licence: str = "") -> dict[str, Pictures]:
     """Middle squares of the images of a folder, by their names; see `denoiser.pictures`."""
-    return {
-        Path(entry.name).stem: _square(image, entry)
-        for image, entry in read_photographs(folder, licence)
-    }
+    return pictures.photographs(folder, licence=licence, cut=_square)
 
 
 def samples() -> dict[str, Pictures]:
     """Middle squares of scikit-image's own photographs."""
-    return {entry.name: _square(image, entry) for image, entry in read_samples()}
+    return pictures.samples(_square)
 
 
 def drawn(seed: int, count: int) -> Pictures:
@@ -52,10 +48,9 @@ def drawn(seed: int, count: int) -> Pictures:
     return Pictures(np.repeat(images[..., None], 3, axis=-1).astype(np.float32), (entry,))
 
 
-def _square(image: np.ndarray, entry: Entry) -> Pictures:
-    linear = decode_srgb(image if image.ndim == 3 else np.stack([image] * 3, axis=-1))
+def _square(linear: np.ndarray) -> np.ndarray:
     square = middle_square(linear, min(linear.shape[:2]))
-    return Pictures(resize(square, (SIDE, SIDE)).astype(np.float32)[None], (entry,))
+    return resize(square, (SIDE, SIDE)).astype(np.float32)[None]
 
 
 class PreparedExamples(eqx.Module):

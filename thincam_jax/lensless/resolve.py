@@ -41,7 +41,7 @@ from thincam_jax.lensless.method import (
 )
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 from thincam_jax.lensless.propagation.radial import profile_length, profile_samples
-from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.propagation.separable import with_nodes
 
 
 class SamplingWarning(UserWarning):
@@ -397,16 +397,12 @@ def resolve(
     """
     mask, grid = camera.mask, camera.sensor.grid
     given = method = as_method(model, pixel_integration)
-    tolerance = method.averages_tolerance
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
     if method.model == "separable":
         require_factored(mask)
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
-    averaged = method.pixel_integration and method.nodes is None
-    if method.model == "separable" and averaged:
-        nodes = pixel_nodes(mask, grid, path, method.float_type, tolerance)
-        method = replace(method, nodes=nodes)
+    method = with_nodes(method, mask, grid, path)
     if method.model == "radial" and method.oversampling is None:
         method = replace(method, oversampling=profile_samples(mask, grid, path, method))
     with allow(method.float_type, mask, grid, path):

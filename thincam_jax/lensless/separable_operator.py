@@ -1,7 +1,5 @@
 """A lensless camera as a short sum of products of its rows and columns: FlatCam, exactly."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +17,7 @@ from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
 from thincam_jax.lensless.method import Model, PsfMethod, psf_method
-from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.propagation.separable import with_nodes
 from thincam_jax.lensless.psf import closed_terms
 
 # Terms below this part of all are those of other terms again: rounding.
@@ -103,10 +101,8 @@ def _factors(camera, scene: Scene, grid: Grid, method: PsfMethod):
     rows, columns = [], []
     for wavelength, weight in light.colours:
         path = camera.path(wavelength, plane.distance)
-        nodes = method.nodes
-        if method.pixel_integration and nodes is None:
-            nodes = pixel_nodes(camera.mask, grid, path, method.float_type)
-        terms = closed_terms(camera.mask, grid, path, replace(method, nodes=nodes))
+        own = with_nodes(method, camera.mask, grid, path)
+        terms = closed_terms(camera.mask, grid, path, own)
         y, x = terms.real_factors()
         rows.append(weight.astype(y.dtype) * y)
         columns.append(x)

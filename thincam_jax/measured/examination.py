@@ -83,7 +83,8 @@ def examine(
     - unknown: NaN, masked or dead pixels of a PSF. Those of captures are not used, as by `Raw`.
     - mosaic: the means of the pixels of 2×2 differ, but not those of one diagonal, green.
     - exposure, and a PSF whose light varies along its border; a computed one is not examined.
-    - swapped: the capture as PSF explains the PSF as capture, and not the reverse; same: it is it.
+    - swapped: the capture as PSF explains the PSF as capture, and not the reverse; same: both are
+      one image.
     """
     options = options or Preparation()
     is_measured = psf is not None and psf.sensor_shape is None

@@ -303,7 +303,7 @@ def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     if kind in ("hadamard", "grey_levels"):
         calibration = HadamardCaptures.load(store) if kind == "hadamard" else measured_levels(found)
         frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
-    elif config.alignment and len(config.targets) > 1:
+    elif config.makes_pairs:
         frames = np.stack([mean for _, mean in itertools.islice(found.means(), SHOWN_PAIRS)])
         calibration = found
     elif kind == "scene" or config.alignment:

@@ -252,6 +252,11 @@ class CaptureConfig(ExperimentConfig):
                 fault = f"virtual.sensor is {virtual.sensor}; give this"
                 yield screen.sensor.shape != virtual.sensor, fault, *place, "sensor", "shape"
 
+    @property
+    def makes_pairs(self) -> bool:
+        """Whether its pictures, on an aligned monitor, make a data set of captures and truths."""
+        return self.alignment is not None and len(self.targets) > 1
+
     @functools.cached_property
     def shown(self) -> dict[str, np.ndarray]:
         """Levels of its pictures by name, see `picture_levels`, read once."""

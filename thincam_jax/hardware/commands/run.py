@@ -113,7 +113,7 @@ class _CaptureRun(Run):
             self.add("system matrix" if kind == "hadamard" else kind.replace("_", " "), steps[kind])
         elif config.matrix is not None:
             self.add("images", self.look)
-        elif config.alignment and len(config.targets) > 1:
+        elif config.makes_pairs:
             self.add("pairs", self.pair_up)
         elif config.plan.kind != "psf_stack" and config.optics is not None:
             self.add("image", self.reconstruct)

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,9 @@ TILE = 192  # pixels
 _SCALES = (1.0, 0.7, 0.5, 0.35)
 
 
+Cut = Callable[[np.ndarray], np.ndarray]  # tiles of an image in linear light
+
+
 @dataclass(frozen=True, eq=False)
 class Pictures:
     """Square tiles of pictures, linear radiance from 0 to 1 in three colours, and their origin."""
@@ -26,20 +29,21 @@ class Pictures:
     manifest: tuple[Entry, ...]
 
 
-def photographs(folder: str | os.PathLike[str], *, licence: str = "") -> dict[str, Pictures]:
+def photographs(
+    folder: str | os.PathLike[str], *, licence: str = "", cut: Cut | None = None
+) -> dict[str, Pictures]:
     """Each image of a folder at several scales, by its name without the suffix.
 
-    `licence`: default the first line of the folder's LICENSE file, else "unknown".
+    - `licence`: default the first line of the folder's LICENSE file, else "unknown".
+    - `cut`: another choice of tiles.
     """
-    return {
-        Path(entry.name).stem: _pictures(image, entry)
-        for image, entry in read_photographs(folder, licence)
-    }
+    read = read_photographs(folder, licence)
+    return {Path(entry.name).stem: _cut(image, entry, cut) for image, entry in read}
 
 
-def samples() -> dict[str, Pictures]:
+def samples(cut: Cut | None = None) -> dict[str, Pictures]:
     """scikit-image's own photographs in the same way."""
-    return {entry.name: _pictures(image, entry) for image, entry in read_samples()}
+    return {entry.name: _cut(image, entry, cut) for image, entry in read_samples()}
 
 
 def drawn(seed: int, count: int) -> Pictures:
@@ -73,9 +77,13 @@ def split(
     return kept, [named[name] for name in held_out]
 
 
-def _pictures(image: np.ndarray, entry: Entry) -> Pictures:
-    """Tiles that cover an image at each scale at which it holds one."""
+def _cut(image: np.ndarray, entry: Entry, cut: Cut | None) -> Pictures:
     linear = decode_srgb(image if image.ndim == 3 else np.stack([image] * 3, axis=-1))
+    return Pictures((cut or _at_scales)(linear), (entry,))
+
+
+def _at_scales(linear: np.ndarray) -> np.ndarray:
+    """Tiles that cover an image at each scale at which it holds one."""
     tiles: list[np.ndarray] = []
     for scale in _SCALES:
         rows, columns = (round(scale * side) for side in linear.shape[:2])
@@ -85,7 +93,7 @@ def _pictures(image: np.ndarray, entry: Entry) -> Pictures:
         reduced = resize(linear, size).astype(np.float32)
         for top in _places(size[0]):
             tiles += [reduced[top : top + TILE, at : at + TILE] for at in _places(size[1])]
-    return Pictures(np.stack(tiles), (entry,))
+    return np.stack(tiles)
 
 
 def _places(side: int) -> list[int]:

@@ -24,7 +24,7 @@ from thincam_jax.lensless.field import points_needed, tangents_of
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms
 from thincam_jax.lensless.method import CLOSED, Model, PsfMethod, models_of, psf_method
-from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.propagation.separable import with_nodes
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
 from thincam_jax.lensless.resolve import (
     Cost,
@@ -147,10 +147,7 @@ class TransferProbe:
     def _transfer(self, precision: Precision, path: LightPath, method: PsfMethod) -> Transfer:
         given = self.camera.mask, self.camera.sensor.pitch, path
         mask, pitch, path = cast(given, method.float_type)
-        if method.model == "separable" and method.pixel_integration and method.nodes is None:
-            grid = self.camera.sensor.grid
-            nodes = pixel_nodes(mask, grid, path, method.float_type, method.averages_tolerance)
-            method = replace(method, nodes=nodes)
+        method = with_nodes(method, mask, self.camera.sensor.grid, path)
         points = SparseGrid(self.places[0], self.places[1], pitch)
         return np.asarray(_transfer(mask, points, path, *self.waves[precision], method), complex)
 

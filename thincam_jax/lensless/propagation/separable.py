@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ from thincam_jax.lensless.masks.base import (
     MaskTerms,
     pairs,
 )
-from thincam_jax.lensless.method import PIXEL_NODES
+from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
 
 
@@ -102,6 +103,14 @@ def pixel_nodes(
     few = [n for n, most in _FEWER[precision].items() if fringes <= most]
     few += [n for n in _MORE if _follow(n, fringes) or left <= tolerance * n]
     return next(iter(few), _MORE[-1])
+
+
+def with_nodes(method: PsfMethod, mask: AbstractMask, grid: Grid, path: LightPath) -> PsfMethod:
+    """The settings with the nodes that the average of "separable" needs, unless it has some."""
+    if method.model != "separable" or not method.pixel_integration or method.nodes is not None:
+        return method
+    nodes = pixel_nodes(mask, grid, path, method.float_type, method.averages_tolerance)
+    return replace(method, nodes=nodes)
 
 
 def average_error(mask: AbstractMask, grid: Grid, path: LightPath, nodes: int) -> float:
