@@ -209,6 +209,22 @@ def test_pairs_give_the_examples_of_their_captures(tmp_path):
         assert np.mean(difference * known) == pytest.approx(0, abs=1e-3)
 
 
+class SmallTruths(CameraLessons):
+    """Examples of pairs whose truths cover a part of the sensor."""
+
+    def examples(self, physics, seed, count):
+        drawn = super().examples(physics, seed, 2)
+        return jax.tree.map(lambda leaf: leaf[..., :10, :12], drawn)
+
+
+def test_crops_are_no_larger_than_truths():
+    small = SmallTruths(PSF, SENSOR, pictures())
+    lessons = ReconstructionLessons(CAMERA, small, small, judged=1, crop=16)
+    task = lessons.task(untrained().physics, 0)
+    for crops in (task.draw(jax.random.key(0)), *task.validation):
+        assert crops.truth.shape[-2:] == crops.images.shape[-2:] == (10, 10)
+
+
 def test_sizes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="crop = 25: give at most 24, the sensor's side"):
         ReconstructionLessons(CAMERA, crop=25)

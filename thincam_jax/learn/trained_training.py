@@ -84,8 +84,9 @@ class ReconstructionLessons:
         pool = train.examples(physics, _seed(seed, _TRAINING), self.pool)
         judges = judge.examples(physics, _seed(seed, _JUDGING), self.judged)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2**31), self.judged)
-        judged = [_crops(judges, self.batch, self.crop, key) for key in keys]
-        return Task(functools.partial(_drawn, pool, self.batch, self.crop), loss, judged)
+        crop = min(self.crop, *pool.truth.shape[-2:])  # truths of pairs may be smaller
+        judged = [_crops(judges, self.batch, crop, key) for key in keys]
+        return Task(functools.partial(_drawn, pool, self.batch, crop), loss, judged)
 
     def fit(self, physics: PhysicsStep, seed: int) -> PhysicsStep:
         """The physics step with the λ that suits drawn captures of the camera best."""

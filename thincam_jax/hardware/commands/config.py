@@ -171,7 +171,8 @@ class CaptureConfig(ExperimentConfig):
     - `targets`: targets at the object's distance of a virtual rig, or on its screen's cells, one;
       or the pictures of a plan of kind pictures, on its cells.
     - `photographs`: a folder of image files, which become targets, each named after its file;
-      `licence`: theirs, which a data set of them states.
+      `licence`: theirs, which a data set of them states; `held_out`: how many of the last ones are
+      its split "test".
     - `matrix`: with which such pictures, or a scene, are reconstructed: matrix.zarr of a
       calibration's run, or the store of its captures; by `methods`.
     - `mask`: on a phase modulator, in pixels of the display.
@@ -192,6 +193,7 @@ class CaptureConfig(ExperimentConfig):
     targets: tuple[ScreenTargetConfig, ...] = ()
     photographs: str | None = None
     licence: str | None = None
+    held_out: Count | None = None
     matrix: str | None = None
     alignment: str | None = None
     methods: tuple[ScreenMethodConfig, ...] = ()
@@ -225,6 +227,9 @@ class CaptureConfig(ExperimentConfig):
         plan, camera = self.plan.build(), self.camera.build(CameraSettings)
         given = {name for part in (self, self.optics or ()) for name, value in part if value}
         yield from plan.rules(given, camera, self.display.pitch, len(self.targets), simulated)
+        pairs = len(self.targets) if self.makes_pairs else 0
+        fault = f"this file makes {pairs} pairs; give fewer, or drop it"
+        yield self.held_out is not None and self.held_out >= pairs, fault, "held_out"
         corrected = kind == "grey_levels" and self.display.options.get("grey_levels")
         yield corrected, "this plan measures it; drop it", "display", "options", "grey_levels"
         unpaired = (self.display.phase_levels is None) != (self.mask is None)

@@ -202,9 +202,8 @@ class _CaptureRun(Run):
         frames, config, folder = self.taken.seen.frames, self.config, self.folder.path / "pairs"
         study = self.study((frames.shape[1], frames.shape[2]))
         width = study.config.object.width
-        found = write_pairs(
-            folder, study, self.taken.calibration, width, config.licence or "not stated"
-        )
+        stated = config.licence or "not stated", config.held_out or 0
+        found = write_pairs(folder, study, self.taken.calibration, width, *stated)
         solve, images, scores = frame_solver(study, width), {}, {}
         solved = [as_picture(np.asarray(solve(frame[None]).image)) for frame in frames]
         grid = object_grid(study, (solved[0].shape[0], solved[0].shape[1]))

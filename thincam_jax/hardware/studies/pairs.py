@@ -27,23 +27,23 @@ capture that the front matter names; captures are turned by 180°.
 
 
 def write_pairs(
-    folder: Path, study: Study, taken: Acquisition, width: float, licence: str
+    folder: Path, study: Study, taken: Acquisition, width: float, licence: str, held_out: int = 0
 ) -> dict[str, int | list[int]]:
     """Write captures/, truths/, psf.tif and a card, which `open_pairs` reads; returns their sizes.
 
     - `study`: cameras of the frames; its targets are the pictures, in the order of their frames.
     - `width`: width of the object that the pictures cover, mm.
+    - `held_out`: number of the last pictures, which are in test/, the others in train/; 0: none.
     """
     rows, columns = taken.sensor_shape
     field = same_parity(square_field(study, width), taken.sensor_shape)
     grid = object_grid(study, field)
-    for name in ("captures", "truths"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    means = taken.means()
-    for target, (_, mean) in zip(study.targets, means, strict=True):
-        file = f"{slug(target.name)}.tif"
-        write_image(folder / "captures" / file, mean[None])
-        write_image(folder / "truths" / file, truth(target, grid)[None])
+    trained_on = len(study.targets) - held_out
+    for number, (target, (_, mean)) in enumerate(zip(study.targets, taken.means(), strict=True)):
+        split = folder / ("train" if number < trained_on else "test") if held_out else folder
+        for name, image in (("captures", mean), ("truths", truth(target, grid))):
+            (split / name).mkdir(parents=True, exist_ok=True)
+            write_image(split / name / f"{slug(target.name)}.tif", image[None])
     # The middle of a measured PSF is its pixel n // 2: an odd number has it on the axis.
     wide = Sensor((rows + 1 - rows % 2, columns + 1 - columns % 2), study.pitch)
     psf = np.asarray(replace(study, sensor=wide).psf(study.methods[0].exposures[0]), np.float32)

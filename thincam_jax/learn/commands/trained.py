@@ -65,7 +65,10 @@ class PsfConfig(Section):
 
 
 class PairsConfig(Section):
-    """Captures with truths, as of `thincam evaluate`; the last `judged` judge the network."""
+    """Captures with truths, as of `thincam evaluate`; the last `judged` judge the network.
+
+    `split`: by default "train" where there is one.
+    """
 
     path: str
     split: str | None = None
@@ -209,11 +212,12 @@ def _pairs(config: TrainedConfig) -> tuple[PairLessons, PairLessons]:
     assert given is not None
     fault = f"{config.place_of('pairs')}pairs: "
     try:
+        found = open_pairs(Path(given.path), given.split or "all", bits=psf.bits)
         asked = EvaluationConfig(
             name=config.name,
             title="",
             path=given.path,
-            split=open_pairs(Path(given.path), given.split, bits=psf.bits).split,
+            split=given.split or ("train" if "train" in found.splits else "all"),
             psf=psf.path,
             background=None if psf.background is None else str(psf.background),
             bits=psf.bits,
