@@ -29,7 +29,7 @@ from thincam_jax.design.setup import fit_power_law
 from thincam_jax.design.space import Limits
 from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
-from thincam_jax.hardware.acquisition.taker import AutoExposure, find_exposure
+from thincam_jax.hardware.acquisition.taker import find_exposure
 from thincam_jax.hardware.base import Region
 from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
@@ -239,13 +239,7 @@ RIGS = (
         steps=call(AcquisitionStep, pattern=0, position=1.0, settings=0, dark=False),
         facts={"a": 1.0},
     ),
-    call(
-        find_exposure,
-        level_at=lambda exposure: 50 * exposure,
-        start=0.01,
-        wanted=call(AutoExposure, target=0.7, quantile=0.9, tolerance=0.1, attempts=4),
-        camera="a",
-    ),
+    call(find_exposure, level_at=lambda exposure: 50 * exposure, start=0.01, camera="a"),
     call(driver, kind="cameras", name="pylon"),
     call(GrblStage.Options, port="a", axis="X", speed=1.0, answer_time=1.0),
     call(ZaberStage.Options, port="a", device=1, axis=1, microstep=1e-4, answer_time=1.0),

@@ -147,7 +147,7 @@ def serial_ports() -> list[Connected]:
     ]
 
 
-def ask_port(port: str, baud_rate: int = 115200) -> list[Connected]:
+def ask_port(port: str) -> list[Connected]:
     """The stages that answer at a serial port: Zaber's, or a GRBL machine.
 
     Sends "?", to which GRBL reports its state, and "/get system.serial", to which each Zaber device
@@ -169,7 +169,7 @@ def ask_port(port: str, baud_rate: int = 115200) -> list[Connected]:
             except HardwareError:  # none in time, or none at this baud rate
                 return
 
-    with closing(SerialLink("serial port", port, baud_rate)) as link:
+    with closing(SerialLink("serial port", port, 115200)) as link:
         for patience in (_PATIENCE, _STARTING):
             for line in lines(link, grbl.ASK, patience):
                 try:

@@ -30,7 +30,6 @@ from thincam_jax.hardware.acquisition import recorder, taker
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.acquisition.taker import AutoExposure
 from thincam_jax.hardware.base import (
     Disconnected,
     Frame,
@@ -328,20 +327,19 @@ def test_what_is_no_frame_is_one_line_and_nothing_is_lost(path, monkeypatch, kin
 
 
 def test_the_exposure_is_found_once(path):
-    wanted = AutoExposure(target=0.3, longest=0.05)
-    procedure = dataclasses.replace(QUICK, exposure="auto", auto_exposure=wanted)
+    procedure = dataclasses.replace(QUICK, exposure="auto")
     world = World()
     world.light = 40.0
     run(world, path, procedure=procedure, progress=stop_after(4))
-    world.light = 60.0  # the exposure that was found is kept
+    world.light = 45.0  # the exposure that was found is kept
     found = run(world, path, procedure=procedure).found
     taken = Acquisition.load(path)
     assert found == (f"exposure {1000 * taken.settings[0].exposure:.4g} ms",)
     assert 1e-5 < taken.settings[0].exposure < 0.001
-    assert np.quantile(taken.frame(1), 0.999) / 4095 == pytest.approx(0.3, rel=0.1)
+    assert np.quantile(taken.frame(1), 0.999) / 4095 == pytest.approx(0.7, rel=0.1)
     for light, error in ((1e-3, OutOfRange), (1e9, Saturated)):
         world.light = light
-        with pytest.raises(error, match="find the exposure: level .*0.3 wanted; change the light"):
+        with pytest.raises(error, match="find the exposure: level .*0.7 wanted; change the light"):
             run(world, path.with_name("b"), procedure=procedure)
     world.light = 10.0
     longer = dataclasses.replace(SETTINGS, exposure=3 * SETTINGS.exposure)

@@ -9,11 +9,7 @@ from lensless.propagation import reference
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless import LightPath
-from thincam_jax.lensless.propagation.angular_spectrum import (
-    angular_spectrum,
-    angular_spectrum_sampling,
-    propagate,
-)
+from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum, propagate
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import separable
 
@@ -153,32 +149,6 @@ def test_energy_and_adjoint():
     transposed = jax.linear_transpose(lambda f: carry(f, pitch, path), u)(w.conj())[0].conj()
     np.testing.assert_allclose(transposed, backward, rtol=0, atol=1e-14)
     assert relative_l2(forward, u) > 0.5
-
-
-@pytest.mark.thorough
-def test_sampling_predicate_tells_good_from_bad():
-    """Local frequency βw/(2π) + w/(2λt) against Nyquist and against the window's band limit."""
-    mask = tc.FresnelZoneAperture(200.0, width=0.5)
-    frequency = 200.0 * 0.5 / (2 * np.pi)
-    cases = {  # pitch, shape, distance -> what is short
-        "fine": (0.01, (60, 77), 20.0),
-        "coarse pitch": (0.1, (6, 8), 20.0),
-        "far": (0.01, (60, 77), 4000.0),
-    }
-    for name, (pitch, shape, distance) in cases.items():
-        path, grid = LightPath(WAVELENGTH, distance), tc.Grid(shape, pitch)
-        value = sampled(mask, grid, path, mask_shape=shape)
-        error = relative_l2(value, exact(mask, grid, path))
-        count = 4 * shape[0]  # padding 2: twice mask and sensor
-        check = angular_spectrum_sampling(path, jnp.asarray(frequency), grid.pitch, count)
-        assert check.adequate == (name == "fine") == (error < 0.05), (name, error, check)
-        assert (check.mask < 1) == (name == "coarse pitch")
-        assert (check.transfer < 1) == (name == "far")
-    window = 240 * 0.01
-    limit = 1 / (WAVELENGTH * np.sqrt((2 * 20.0 / window) ** 2 + 1))
-    fine = angular_spectrum_sampling(GENTLE, jnp.asarray(frequency), GRID.pitch, 240)
-    np.testing.assert_allclose(fine.transfer, limit / frequency, rtol=1e-12)
-    np.testing.assert_allclose(fine.mask, 50.0 / frequency, rtol=1e-12)
 
 
 def test_even_oversampling_is_refused():

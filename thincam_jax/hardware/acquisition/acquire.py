@@ -33,7 +33,13 @@ from thincam_jax.hardware.acquisition.recorder import (
     versions,
 )
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.acquisition.taker import Procedure, Taker, find_exposure, full_scale
+from thincam_jax.hardware.acquisition.taker import (
+    QUANTILE,
+    Procedure,
+    Taker,
+    find_exposure,
+    full_scale,
+)
 from thincam_jax.hardware.base import CameraSettings, Identity, NotHomed, OutOfRange
 from thincam_jax.hardware.displays.settle import LONGEST, Shutter, settle_calibrate
 
@@ -240,20 +246,20 @@ def _measured(run: Taker) -> tuple[CameraSettings, ...]:
         def level_at(exposure: float) -> float:
             settings = run.persist(lambda: run.set_near(replace(asked[0], exposure=exposure)))
             frame, _ = run.take(lit, settings, probe=True)
-            level = np.quantile(frame.pixels, wanted.auto_exposure.quantile)
+            level = np.quantile(frame.pixels, QUANTILE)
             return float(level) / full_scale(frame)
 
         start = asked[0].exposure
-        ratio = find_exposure(level_at, start, wanted.auto_exposure, run.name("camera")) / start
+        ratio = find_exposure(level_at, start, run.name("camera")) / start
         asked = tuple(replace(one, exposure=ratio * one.exposure) for one in asked)
     settings = tuple(run.persist(lambda one=one: run.set_near(one)) for one in asked)
     if measured:
         run.persist(lambda: run.configure(settings[0]))
         patterns = run.rig.render(BLACK), run.rig.render(run.plan.pattern(lit))
         given = {"longest": LONGEST, "timeout": wanted.timeout}
-        found = settle_calibrate(run.rig.display, run.rig.camera, patterns, **given)
+        settle = settle_calibrate(run.rig.display, run.rig.camera, patterns, **given)
         run.forget()
-        run.procedure = replace(wanted, settle=found.time)
+        run.procedure = replace(wanted, settle=settle)
     return settings
 
 

@@ -33,68 +33,41 @@ from thincam_jax.hardware.base import (
     grab,
 )
 
+# The exposure that is found has this quantile of the pixels at the target, a part of full scale.
+QUANTILE, _TARGET, _TOLERANCE = 0.999, 0.7, 0.1
+_SHORTEST, _LONGEST, _ATTEMPTS = 1e-5, 1.0, 12  # s, and frames at most
 _MOST = 8.0  # largest factor from one exposure to the next
-_REMEDY = "change the light or the limits of the auto-exposure"
+_REMEDY = "change the light"
 
 
 @checked
-@dataclass(frozen=True)
-class AutoExposure:
-    """Target of the search: `quantile` of the pixels at `target` of full scale, within `tolerance`.
-
-    - `shortest`, `longest`: limits of the exposure, s. `attempts`: frames at most.
-    """
-
-    target: float = 0.7
-    quantile: float = 0.999
-    tolerance: float = 0.1
-    shortest: float = 1e-5
-    longest: float = 1.0
-    attempts: int = 12
-
-    def __post_init__(self):
-        if not 0 < self.target < 1 or not 0 < self.quantile <= 1 or self.tolerance <= 0:
-            raise ValueError(
-                f"target = {self.target}, quantile = {self.quantile}, tolerance = {self.tolerance}"
-                "; give 0 < target < 1, 0 < quantile <= 1 and tolerance > 0"
-            )
-        if not 0 < self.shortest <= self.longest or self.attempts < 1:
-            raise ValueError(
-                f"shortest = {self.shortest} s, longest = {self.longest} s, attempts = "
-                f"{self.attempts}; give 0 < shortest <= longest and at least 1 attempt"
-            )
-
-
-@checked
-def find_exposure(
-    level_at: Callable[[float], float], start: float, wanted: AutoExposure, camera: str
-) -> float:
-    """Exposure, s, at which `level_at` reaches the target.
+def find_exposure(level_at: Callable[[float], float], start: float, camera: str) -> float:
+    """Exposure, s, at which `level_at` reaches 0.7 within a tenth.
 
     - `level_at`: takes a frame with an exposure and returns its level as a fraction of full scale.
 
     The level grows linearly with the exposure, apart from an offset, up to saturation.
 
-    **Errors**: Saturated where the shortest exposure is too bright; OutOfRange where the longest is
-    too dark, or the search does not end.
+    **Errors**: Saturated where 10 µs are too bright; OutOfRange where 1 s is too dark, or the
+    search does not end.
     """
 
     def within(exposure: float) -> float:
-        return min(max(exposure, wanted.shortest), wanted.longest)
+        return min(max(exposure, _SHORTEST), _LONGEST)
 
     exposure, level = within(start), 0.0
-    for _ in range(wanted.attempts):
+    for _ in range(_ATTEMPTS):
         level = level_at(exposure)
-        if abs(level - wanted.target) <= wanted.tolerance * wanted.target:
+        if abs(level - _TARGET) <= _TOLERANCE * _TARGET:
             return exposure
-        factor = 1 / _MOST if level >= 1 else wanted.target / max(level, wanted.target / _MOST)
+        factor = 1 / _MOST if level >= 1 else _TARGET / max(level, _TARGET / _MOST)
         following = within(exposure * factor)
         if following == exposure:
-            cause = f"level {level:.3g} at {exposure:g} s, {wanted.target:g} wanted"
-            kind = Saturated if level > wanted.target else OutOfRange
+            cause = f"level {level:.3g} at {exposure:g} s, {_TARGET:g} wanted"
+            kind = Saturated if level > _TARGET else OutOfRange
             raise kind(camera, "find the exposure", cause, _REMEDY)
         exposure = following
-    cause = f"level {level:.3g} after {wanted.attempts} frames, {wanted.target:g} wanted"
+    cause = f"level {level:.3g} after {_ATTEMPTS} frames, {_TARGET:g} wanted"
     raise OutOfRange(camera, "find the exposure", cause, _REMEDY)
 
 
@@ -114,7 +87,7 @@ class Procedure:
     - `saturated`: largest allowed share of saturated pixels.
     - `position_tolerance`: mm between the commanded position and the one reached, of a motor.
     - `exposure`: "given" with the plan, or found before the first frame, "auto": the first
-      settings' by the search `auto_exposure`; the others keep their ratio to it.
+      settings' by `find_exposure`; the others keep their ratio to it.
     """
 
     settle: Annotated[float | None, quantity("s", non_negative=True, optional=True)] = 0.0
@@ -124,7 +97,6 @@ class Procedure:
     saturated: Annotated[float, quantity(least=0.0, most=1.0)] = 0.01
     position_tolerance: Annotated[float, quantity("mm", non_negative=True)] = 0.01
     exposure: Annotated[Literal["given", "auto"], choice(("given", "auto"))] = "given"
-    auto_exposure: AutoExposure = AutoExposure()
 
     def __post_init__(self):
         check_fields(self)

@@ -23,23 +23,6 @@ _BISECTIONS = 5
 _SIGMAS = 2.0
 
 
-@dataclass(frozen=True)
-class SettleTime:
-    """Result of `settle_calibrate`.
-
-    After `time` (s) at most `tolerance` of the previous pattern is left. Measurably more was last
-    seen `uncertainty` (s) before. `delays` and `parts` are the measured fractions, `noise` the
-    standard deviation of one.
-    """
-
-    time: float
-    uncertainty: float
-    tolerance: float
-    delays: tuple[float, ...]
-    parts: tuple[float, ...]
-    noise: float
-
-
 def settle_calibrate(
     display: Display,
     camera: Camera,
@@ -48,12 +31,13 @@ def settle_calibrate(
     tolerance: float = 0.01,
     longest: float = LONGEST,
     timeout: float = 1.0,
-) -> SettleTime:
+) -> float:
     """Find the settle time, from the return of `show` to the call of `trigger_and_grab`, in s.
 
-    The longer of both directions, black to white and back or between two `patterns` of the
-    display's shape. It excludes the driver's delay before the trigger, so that it is valid for this
-    camera and its exposure or a longer one. After `longest` the display counts as settled.
+    After it at most `tolerance` of the previous pattern is left. The longer of both directions,
+    black to white and back or between two `patterns` of the display's shape. It excludes the
+    driver's delay before the trigger, so that it is valid for this camera and its exposure or a
+    longer one. After `longest` the display counts as settled.
 
     **Errors**: Timeout where it is not settled after `longest`; OutOfRange where the camera does
     not distinguish the patterns well enough for the tolerance; those of the devices.
@@ -69,38 +53,33 @@ def settle_calibrate(
     if _SIGMAS * rig.noise > tolerance / 2:
         cause = f"noise of {rig.noise:.2g} of the patterns' contrast, tolerance {tolerance:g}"
         raise OutOfRange(device, operation, cause, "expose longer or allow a larger tolerance")
-    shots: list[tuple[float, float]] = []
 
-    def settled(delay: float) -> tuple[float, int]:
-        """Actual delay, and 1 for settled, −1 for not settled, 0 where noise leaves it open."""
+    def settled(delay: float) -> tuple[float, float, int]:
+        """Delay and fraction; 1 for settled, −1 for not settled, 0 where noise leaves it open."""
         actual, part = rig.part(delay)
-        shots.append((actual, part))
         margin = _SIGMAS * rig.noise
-        return actual, int(part + margin <= tolerance) - int(part - margin > tolerance)
+        return actual, part, int(part + margin <= tolerance) - int(part - margin > tolerance)
 
-    unsettled, undecided = 0.0, 0.0
-    time_found, verdict = settled(longest)
+    found, part, verdict = settled(longest)
     if verdict != 1:
-        cause = f"{shots[0][1]:.2g} of the pattern before after {longest:g} s"
+        cause = f"{part:.2g} of the pattern before after {longest:g} s"
         raise Timeout(device, operation, cause, "raise longest")
+    undecided = 0.0
     for delay in np.linspace(longest, 0.0, _SWEEP + 1)[1:]:
-        actual, verdict = settled(float(delay))
+        actual, _, verdict = settled(float(delay))
         if verdict != 1:
             undecided = max(undecided, actual)
-            if verdict == -1:
-                unsettled = max(unsettled, actual)
-                break
         elif not undecided:
-            time_found = actual
+            found = actual
+        if verdict == -1:
+            break
     for _ in range(_BISECTIONS):
-        actual, verdict = settled((max(undecided, unsettled) + time_found) / 2)
+        actual, _, verdict = settled((undecided + found) / 2)
         if verdict == 1:
-            time_found = min(time_found, actual)
+            found = min(found, actual)
         else:
             undecided = max(undecided, actual)
-            unsettled = max(unsettled, actual) if verdict == -1 else unsettled
-    delays, parts = zip(*sorted(shots), strict=True)
-    return SettleTime(time_found, time_found - unsettled, tolerance, delays, parts, rig.noise)
+    return found
 
 
 class _Rig:

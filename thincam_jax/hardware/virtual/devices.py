@@ -32,7 +32,7 @@ from thincam_jax.hardware.base import (
     Stage,
 )
 from thincam_jax.hardware.cameras.features import BIT_DEPTHS
-from thincam_jax.hardware.displays.levels import GreyLevelDisplay, GreyLevels
+from thincam_jax.hardware.displays.levels import GreyLevelDisplay
 from thincam_jax.hardware.stages.manual import ManualStage
 from thincam_jax.hardware.virtual.rig import VirtualRig
 
@@ -186,9 +186,8 @@ class VirtualDisplay(GreyLevelDisplay):
         on_show: Callable[[np.ndarray], None],
         *,
         faults: Faults | None = None,
-        grey_levels: GreyLevels | None = None,
     ):
-        super().__init__(grey_levels)
+        super().__init__()
         self.shape, self._on_show, self._faults = shape, on_show, faults or Faults()
 
     def close(self) -> None:

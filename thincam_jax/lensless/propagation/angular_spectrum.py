@@ -4,7 +4,7 @@ import math
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_shape
 from thincam_jax._core.precision import as_complex, squared_modulus, turn_phasor
@@ -13,39 +13,6 @@ from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 
 PADDING = 2.0  # the window of a PSF over mask and sensor side by side
-
-
-class Sampling(eqx.Module):
-    """Sampling quality of a field; each number should be at least 1.
-
-    - `mask`: Nyquist frequency of the samples over the highest local frequency behind the mask.
-    - `transfer`: band limit of the transfer function on this window over that frequency.
-    - `adequate`: both are at least 1.
-    """
-
-    mask: Float[Array, ""]
-    transfer: Float[Array, ""]
-    adequate: Bool[Array, ""]
-
-
-def angular_spectrum_sampling(
-    path: LightPath, frequency: Float[Array, ""], pitch: Float[Array, ""], count: int
-) -> Sampling:
-    r"""Sampling condition of `propagate`: is a field of that local frequency carried right?
-
-    The samples must resolve the field, ν < 1/(2 pitch), and the transfer function's phase must not
-    turn by more than π between frequencies, ν < 1/(λ√((2Δν d)² + 1)), Δν = 1/(count·pitch)
-    (Matsushima & Shimobaba, Opt. Express 17, 19662 (2009), Eq 13).
-
-    - `frequency`: highest local frequency of the field just behind the mask, cycles/mm; for an FZA
-      lit from t it is β·width/(2π) + width/(2λt).
-    - `pitch`, `count`: sample distance in mm and number of samples of the padded window.
-    """
-    nyquist = 1 / (2 * pitch)
-    limit = _band_limit(path, count * pitch)
-    return Sampling(
-        nyquist / frequency, limit / frequency, (nyquist >= frequency) & (limit >= frequency)
-    )
 
 
 def propagate(

@@ -50,6 +50,8 @@ _FREQUENCIES = (32, 16)
 _MARGIN = 0.02
 # Of the glass and the film.
 _INDEX = 1.5
+# Moments of the object's radiance, whose variance a power law spreads.
+_MEAN, _VARIANCE = 0.5, 0.08
 
 
 class Plate(Module):
@@ -115,8 +117,6 @@ class Viewing(eqx.Module):
       whose Nyquist frequency ends the integral.
     - `snr_db`: signal-to-noise ratio of the default plate's captures, dB; another's follows from
       its light.
-    - `mean`, `variance`: moments of the object's radiance. `prior`: how its variance is spread, by
-      default `PowerLaw(2.5)`.
     - `field_of_view`: least one of plates that `find_plate` finds, along y, rad, half of it on
       either side of the axis; 0 for any.
 
@@ -128,17 +128,12 @@ class Viewing(eqx.Module):
     object_width: float = 150.0
     cell: float = 150.0 / 64
     snr_db: float = 30.0
-    mean: float = 0.5
-    variance: float = 0.08
-    prior: PowerLaw | None = None
     field_of_view: float = 0.0
 
     def __check_init__(self):
         for name in ("object_distance", "object_width", "cell"):
             checks.positive(name, getattr(self, name), "mm")
         checks.decibels("snr_db", self.snr_db)
-        checks.non_negative("mean", self.mean, "a ratio")
-        checks.positive("variance", self.variance, "a ratio")
         if not 0 <= self.field_of_view < math.pi:
             raise ValueError(
                 f"field_of_view = {self.field_of_view:g} rad; give 0 for any, or less than π"
@@ -164,7 +159,7 @@ class Judged(Module):
 def noise_variance(viewing: Viewing, light: Float[Array, ""]) -> Float[Array, ""]:
     """σ² of the captures of a plate of that light, in the units of the weights squared, mm²."""
     reference = _light(_rays(Plate(), viewing))
-    power = viewing.mean**2 + viewing.variance
+    power = _MEAN**2 + _VARIANCE
     return 10 ** (-viewing.snr_db / 10) * power * reference * light
 
 
@@ -182,11 +177,12 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     v, u = ((np.arange(n) + 0.5) / n for n in _FREQUENCIES)
     grid = np.stack(np.meshgrid(2 * v - 1, u, indexing="ij"), axis=-1).reshape(-1, 2) * highest
     frequencies = jnp.asarray(grid, dtype)
-    prior = PowerLaw(2.5) if viewing.prior is None else viewing.prior
-    density = prior(jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype))
+    density = PowerLaw(2.5)(
+        jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype)
+    )
     # The half plane of u > 0 holds half of the variance.
     element = 2 * highest**2 / len(grid)
-    density = density * viewing.variance / (2 * jnp.sum(density) * element)
+    density = density * _VARIANCE / (2 * jnp.sum(density) * element)
     offset = rays.points - rays.points[:1, :, :1]
     phase = jnp.einsum("ipsc,fc->ipsf", offset, frequencies, precision="highest")
     # Reduced to turns before 2π.
