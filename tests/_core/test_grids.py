@@ -57,17 +57,6 @@ def test_fast_shape_holds_the_shape():
     assert fast_shape((1874, 7), real=True) == (1875, 8)
 
 
-@pytest.mark.parametrize("shape", [(0, 3), (2, -1), (2.5, 3), (3,), 4, "ab"])
-def test_impossible_shapes(shape):
-    with pytest.raises(ValueError, match="shape ="):
-        Grid(shape, 0.1)
-
-
-def test_pitch_that_is_no_number():
-    with pytest.raises(TypeError, match="pitch = '5.5 um' is not a real number; give it in mm"):
-        Grid((2, 3), "5.5 um")
-
-
 class TestBlocks:
     @pytest.mark.parametrize("of", [np.asarray, jnp.asarray])
     def test_sums_and_means_block_by_block(self, of):

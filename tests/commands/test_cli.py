@@ -88,14 +88,6 @@ class TestExitCode2:
         assert line.startswith(f"{file}:{number}: mask.width: 2 has no unit")
         assert not (tmp_path / "out").exists()
 
-    def test_every_fault_has_its_line(self, file):
-        result = call("run", file, "--set", "mask.width=2", "--set", "seed=x")
-        assert result.exit_code == 2
-        first, second = result.stderr.splitlines()
-        # Long lines are not broken: a terminal wraps them, a log keeps them whole.
-        assert first == "thincam: --set seed=x: seed: 'x': input should be a valid integer"
-        assert second.startswith("thincam: --set mask.width=2: mask.width: 2 has no unit")
-
     def test_image_that_is_missing(self, file, tmp_path):
         out = tmp_path / "out"
         line = one_line(call("run", file, "--out", out, "--set", "targets.1.path=no.png"))

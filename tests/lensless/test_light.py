@@ -113,28 +113,6 @@ def test_shading_is_the_share_of_rays(depth, opening, width):
     np.testing.assert_allclose(found, share, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"model": "exact"}, "^model = 'exact' is unknown; choose one of 'geometric'"),
-        *(
-            ({"precision": name}, r"^precision = .* is unknown; choose one of 'float32'")
-            for name in ("half", "float16", "double", 64)
-        ),
-        ({"oversampling": 3}, "'separable' is a closed form: leave oversampling"),
-        ({"oversampling": 4, "model": "angular_spectrum"}, "oversampling = 4: give an odd number"),
-        ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give a whole number"),
-        ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give a whole"),
-        ({"mask_shape": (3, 0), "model": "angular_spectrum"}, "mask_shape = .* of at least 1"),
-    ],
-)
-def test_settings_that_are_refused(settings, message):
-    """By its own check: that of the annotations, on in the tests, is taken off."""
-    with pytest.raises(ValueError, match=message) as error:
-        tc.PsfMethod.__init__.__wrapped__(object.__new__(tc.PsfMethod), **settings)
-    assert "\n" not in str(error.value)
-
-
 def test_pixels_are_averaged_unless_either_says_no():
     """By default, as `capture` and `Cameras` do; a method and the function that takes it."""
     camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((6, 7), 0.05), 2.0)

@@ -4,13 +4,11 @@ import importlib
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, point_otf, point_psf, quick, value_and_slope
-from thincam_jax.lensless.method import MODELS
 
 INF = float("inf")
 WAVELENGTH = 500e-6
@@ -224,18 +222,6 @@ def test_changing_a_value_compiles_nothing():
 
 
 # --- bad and extreme input ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("evaluate", [tc.psf, tc.otf])
-def test_unknown_model_lists_the_known(evaluate, monkeypatch):
-    """As a user meets it, without the type checks of the tests."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    listed = ", ".join(f"'{m}'" for m in MODELS)
-    with pytest.raises(
-        ValueError, match=f"model = 'fraunhofer' is unknown; choose one of {listed}"
-    ):
-        evaluate(camera_of(), wavelength=WAVELENGTH, model="fraunhofer")
-    assert len(MODELS) == 7
 
 
 @pytest.mark.thorough

@@ -74,10 +74,3 @@ def test_refracted():
     np.testing.assert_allclose(refracted(30 * deg, 1.0, 1.5), np.arcsin(1 / 3), rtol=1e-14)
     with pytest.raises(ValueError, match="is totally reflected.*give a smaller angle"):
         refracted(60 * deg, 1.5, 1.0)
-
-
-def test_an_obtuse_angle_is_refused():
-    with pytest.raises(ValueError, match="reference_angle = 2.07.* is not acute; give the angle"):
-        wg.VolumeHologram.record(
-            RECORDED, 0.0, 118.8 * deg, index=1.5, thickness=0.016, index_modulation=0.02
-        )

@@ -39,37 +39,9 @@ def test_interrupt(file, interrupted, tmp_path, monkeypatch):
 
 
 class TestExitCode2:
-    @pytest.mark.parametrize(
-        ("setting", "part"),
-        [
-            ("search.free.0.bounds=[9 /mm^2, 8 /mm^2]", "bounds cross: 9 to 8 rad/mm^2"),
-            ("search.limits.mask_pixel=0.2 mm", "no design is feasible: beta of capture 1, 2 ≥ 12"),
-            ("search.limits.captures=0", "a whole number from 1 to 8"),
-            ("targets.1.path=missing.png", "targets[1]: "),
-            ("pareto.light.bounds=[10, 100]", "pareto.light: light needs noise that counts elec"),
-            ("pareto.thickness.bounds=[2 mm, 3 mm]", "pareto.thickness: no distance is free"),
-            ("sensor.shape=[4, 64]", "sensor.shape: 4×64 pixels are too few"),
-        ],
-    )
-    def test_fault_before_anything_runs(self, file, tmp_path, setting, part):
-        out = tmp_path / "out"
-        assert part in one_line(call("design", file, "--set", setting, "--out", out))
-        assert not out.exists()
-
     def test_a_picture_too_small_to_measure(self, file, tmp_path):
         small = ("--set", "prior={measured: true}", "--set", "targets.1.path=small.png")
         image = np.arange(20 * 40, dtype=np.uint8).reshape(20, 40)
         skimage.io.imsave(tmp_path / "small.png", image, check_contrast=False)
         line = one_line(call("design", file, *small))
         assert line.startswith("targets[1]: 20×40 pixels are too few to measure a spectrum")
-
-    def test_folder_of_another_configuration(self, file, tmp_path):
-        out = tmp_path / "out"
-        designs.DesignFolder(out).claim(tiny.load(file))
-        line = one_line(call("design", file, "--out", out, "--set", "seed=8"))
-        assert line.startswith(f"--out {out}: holds a design of another configuration (see {out}")
-        line = one_line(call("design", file, "--out", tmp_path))
-        assert "is not empty and holds no design" in line
-
-    def test_a_study_is_told_apart(self, file):
-        assert "give it to 'thincam design'" in one_line(call("run", file))

@@ -22,23 +22,6 @@ def line_of(part):
     return found
 
 
-def test_values_and_defaults(tmp_path):
-    config = tiny.design(tmp_path)
-    assert config.search.free[0].bounds == (12.0, 30.0)
-    assert config.search.objective == "bayes_error"
-    assert config.validation.best == 1
-    without = tiny.TEXT.replace("prior:\n  exponent: 2.5\n", "")
-    assert tiny.design(tmp_path, text=without).prior.measured
-
-
-def test_resolved_file_is_read_back(tmp_path):
-    config = tiny.design(tmp_path, "search.objective=unevenness", "search.band=[0.1, 0.4]")
-    path = tmp_path / "again.yaml"
-    path.write_text(dump_config(config), encoding="utf-8")
-    assert "validate:\n" in dump_config(config)
-    assert tiny.load(path) == config
-
-
 @pytest.mark.parametrize(
     ("entry", "captures"),
     [

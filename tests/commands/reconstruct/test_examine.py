@@ -99,10 +99,3 @@ def test_noise_that_was_given(paths, tmp_path):
     (line,) = warnings_of(reconstruct(paths, out, "--noise", 100, *more))
     assert "counts of noise are found, and 100 are given; leave --noise out" in line
     assert not warnings_of(reconstruct(paths, out, *more))
-
-
-def test_an_image_of_nothing_is_an_error_if_strict(paths, tmp_path):
-    out = tmp_path / "a.npy"
-    result = reconstruct(paths, out, "--bits", 12, "--tau", 1e6, "--strict")
-    assert result.exit_code == 2 and not out.exists()
-    assert "is neither image nor noise" in result.stderr

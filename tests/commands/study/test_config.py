@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers import ROOT, rows
+from helpers import rows
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import load_experiment
@@ -135,13 +135,6 @@ def test_harmonics_that_so_few_phases_cannot_tell(tmp_path):
     assert "8 steps tell 1 to 3 apart; give some of them, each once" in line
 
 
-def test_unknown_key_lists_the_keys_of_its_section_only(tmp_path):
-    (line,) = faults(tmp_path, changed("  profile: cosine", "  shape: cosine"))
-    allowed = line.split("allowed here: ")[1].split(", ")
-    assert allowed[:6] == ["width", "profile", "pixel_pitch", "fill_factor", "height", "harmonics"]
-    assert "family" in allowed and "pitch" not in allowed
-
-
 def test_every_fault_has_its_own_line(tmp_path):
     text = changed("pitch: 40 um", "pitch: 40")
     text = changed("width: 2 mm", "width: -2 mm", text)
@@ -153,16 +146,6 @@ def test_every_fault_has_its_own_line(tmp_path):
         [str(line_of(text, "width: -2 mm")), "mask.width"],
         [str(line_of(text, "kind: chart")), "targets[0].kind"],
     ]
-
-
-SHIPPED = sorted(p.name for p in (ROOT / "configs").glob("fza_*.yaml"))
-SHIPPED.remove("fza_refocus.yaml")  # of another kind: tests/commands/refocus/test_run.py
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_files_round_trip(name, tmp_path):
-    config = load_experiment(ROOT / "configs" / name)
-    assert load(tmp_path, dump_config(config)) == config
 
 
 CURVATURES = st.floats(1e-7, 1e7)
@@ -191,17 +174,6 @@ def test_dump_round_trips_to_the_last_bit(tmp_path_factory, wavelength, pitch, b
     assert again == config
     assert (again.wavelength, again.sensor.pitch) == (wavelength, pitch)
     assert dump_config(again) == text
-
-
-@pytest.mark.parametrize("extra", ["", ", wavelength: 0.5 um"])
-def test_same_shot_twice(tmp_path, extra):
-    """One capture under two descriptions would count its noise as two independent ones."""
-    text = changed(
-        "{beta: 21 rad/mm^2, distance: 3 mm}", "{beta: 25 /mm^2, distance: 0.3 cm" + extra + "}"
-    )
-    (line,) = faults(tmp_path, text)
-    number = line_of(text, "    synthesis: separate") + 1  # the line of the second 'shots:'
-    assert line.startswith(f"{number}: methods[1].shots: shots hold an entry twice")
 
 
 def test_pictures_are_light_and_pages_show_their_codes(tmp_path):

@@ -112,17 +112,6 @@ def test_columns_that_some_rows_lack(folder, config):
     assert table.column_names[-1] == "seconds"
 
 
-def test_folder_of_another_study_or_of_other_things(folder, config, tmp_path):
-    folder.claim(config)
-    other = mini.study(tmp_path, "seed=9")
-    with pytest.raises(ConfigError, match="holds a sweep of another configuration"):
-        folder.claim(other)
-    with pytest.raises(ConfigError, match="is not empty and holds no sweep"):
-        SweepFolder(tmp_path).claim(config)
-    with pytest.raises(ConfigError, match="cannot be made a folder"):
-        SweepFolder(tmp_path / "mini.yaml").claim(config)
-
-
 def test_first_start_that_was_killed(config, tmp_path):
     """Between the neighbour that was written and its renaming."""
     folder = SweepFolder(tmp_path / "killed")

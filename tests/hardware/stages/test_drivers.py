@@ -160,12 +160,3 @@ def test_too_slow_it_is_stopped(slow):
     assert not stage.homed  # it stopped half-way
     stage.home()
     assert stage.position() == pytest.approx(device.true_position, abs=STEP)
-
-
-@pytest.mark.parametrize(
-    ("kind", "options"),
-    [("zaber", {"microstep": 0.0}), ("grbl", {"speed": 0.0}), ("grbl", {"answer_time": -1.0})],
-)
-def test_options_that_cannot_be_are_refused(kind, options):
-    with pytest.raises(ValueError, match="give more than 0"):
-        STAGES[kind][0].Options(port="", **options)

@@ -71,25 +71,3 @@ def test_tiles():
     np.testing.assert_allclose([float(side) for side in mask.extent], [10 * CELL, 15 * CELL])
     assert mask.decoder.shape == (5, 5)
     assert float(mask.finest_frequency) == pytest.approx(1 / 0.06)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: tc.ModifiedUniformlyRedundantArray(100, CELL), "order = 100 .* give 97 or 101$"),
-        (lambda: tc.ModifiedUniformlyRedundantArray(3, CELL), "order = 3 .* give 5$"),
-        (lambda: tc.ModifiedUniformlyRedundantArray(5, -CELL), "cell = -0.03 mm is not positive"),
-        (lambda: tc.ModifiedUniformlyRedundantArray(5, CELL, tiles=0), "tiles = 0; give at least"),
-        (
-            lambda: UniformlyRedundantArray((11, 7), CELL),
-            r"orders = \(11, 7\) .* give \(7, 5\) or \(13, 11\)$",
-        ),
-        (lambda: maximum_length_sequence(100), "length = 100 .* give 63 or 127$"),
-        (lambda: tc.SeparableMask([1.0, -1.0], [1.0], CELL), "rows runs from -1 to 1; give trans"),
-        (lambda: tc.SeparableMask([1.0], np.eye(2), CELL), r"columns has shape \(2, 2\); give a"),
-    ],
-)
-def test_refusals(make, message):
-    with pytest.raises(ValueError, match=message) as error:
-        make()
-    assert "\n" not in str(error.value)

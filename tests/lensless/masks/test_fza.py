@@ -98,21 +98,6 @@ def test_display_pixels():
     assert np.all(fine[:, [0, 9]] < 1e-12)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            {"pixel_pitch": 0.03},
-            r"width = 1 mm is not a whole number of cells of pixel_pitch = 0.03",
-        ),
-        ({"pixel_pitch": 0.03}, "give width = 0.99 or 1.02 mm"),
-    ],
-)
-def test_refusals(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        tc.FresnelZoneAperture(**({"beta": 25.0, "width": 1.0} | arguments))
-
-
 def test_other_numbers_keep_the_display():
     """Its pixels are of a pitch, which a copy with another β or width keeps."""
     mask = tc.FresnelZoneAperture(25.0, width=1.6, height=0.8, pixel_pitch=20 * um)
