@@ -280,6 +280,7 @@ class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
     def _methods_fit(self):
         check_names(self, "methods", self.pictured)
         _check_family(self)
+        sensor, noise = self.sensor.build(), self.noise and self.noise.build()
         methods = []
         for index, method in enumerate(self.methods):
             try:
@@ -290,7 +291,7 @@ class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
             if self.noise is None and method.kind == "wiener":
                 message = "wiener weighs noise against signal; give a 'noise' section"
                 raise FieldError(message, "methods", index, "kind")
-        check_methods(methods, self.sensor.build(), self.noise and self.noise.build())
+        check_methods(methods, sensor, noise)
         return self
 
 
@@ -362,7 +363,7 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
 
 def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
     """Each shot of a method at each of its phases; one after another where the object moves."""
-    shots, phases = method.shots, method.shot_phases()
+    shots, phases, motion = method.shots, method.shot_phases(), config.motion
     settings = Exposures(
         [shot.beta or 0.0 for shot in shots],  # 0: of a mask without zones
         [shot.distance for shot in shots],
@@ -378,7 +379,7 @@ def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
             exposures = exposures.at_once(method.mosaic.build())
         except ValueError as error:
             raise FieldError(str(error), "mosaic") from None
-    return exposures.of_moving(config.motion) if config.motion else exposures
+    return exposures.of_moving(motion) if motion else exposures
 
 
 def build_solver(

@@ -93,5 +93,5 @@ def _light(
     how = as_method(model, pixel_integration is not False)
     if camera.sensor.angular_response is not None and how.field_tolerance is None:
         warnings.warn(_ON_AXIS, AccuracyWarning, stacklevel=4)
-    planes = (expose(camera, plane, scene.spectrum, how) for plane in scene.planes)
+    planes = (expose(camera, plane, scene.spectrum.colours, how) for plane in scene.planes)
     return functools.reduce(operator.add, planes)

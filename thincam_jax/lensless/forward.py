@@ -24,18 +24,23 @@ from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.lensless.resolve import convolution_cost
 
+Colours = Sequence[tuple[Number, Number]]
+
 # Pixels by which a field grows where an image moves.
 _STEP = 16
 
 
 def expose(
-    camera: LenslessCamera, plane: ImagePlane, spectrum: Spectrum, method: PsfMethod
+    camera: LenslessCamera, plane: ImagePlane, colours: Colours, method: PsfMethod
 ) -> Float[Array, "*batch y x"]:
-    """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
+    """Noise-free capture of one plane: its projection convolved with the PSF of its light.
+
+    `colours`: pairs of wavelength, mm, and weight.
+    """
     shape = projected_shape(camera, plane)
     shape = shape if method.field_tolerance else in_steps(shape)
     check_memory(camera.sensor, shape, plane.image.shape[:-2])
-    seen = operator_of(camera, spectrum.colours, plane.distance, shape, method)
+    seen = operator_of(camera, colours, plane.distance, shape, method)
     field = project(camera, plane, shape)
     if field.ndim == 2 or checks.holds_traced(field, seen):
         return seen(field)
@@ -66,7 +71,7 @@ def imaging_operator(
 
 def operator_of(
     camera: LenslessCamera,
-    colours: Sequence[tuple[Number, Number]],
+    colours: Colours,
     object_distance: Number,
     field_shape: tuple[int, int],
     method: PsfMethod,

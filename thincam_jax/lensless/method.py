@@ -17,6 +17,7 @@ from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
     has_few_terms,
+    other_models,
     term_count,
     zone_orders,
 )
@@ -166,12 +167,20 @@ def as_method(model: Model | PsfMethod, pixel_integration: bool = True) -> PsfMe
 def psf_method(
     mask: AbstractMask, grid: Grid, model: Model | PsfMethod, pixel_integration: bool = True
 ) -> PsfMethod:
-    """The settings with the defaults for a mask and grid in place of None."""
+    """The settings with the defaults for a mask and grid in place of None.
+
+    **Errors**: TypeError for "separable" of a mask without terms.
+    """
     method = as_method(model, pixel_integration)
     precision = method.precision or precision_of(grid.pitch)
     method = replace(method, precision=precision, field_tolerance=None)
     if method.model == "separable" and isinstance(mask, RadialMask):
         method = replace(method, model="radial")
+    if method.model == "separable" and not isinstance(mask, AbstractFactoredMask):
+        raise TypeError(
+            "model 'separable' needs a mask of few separable terms, such as FresnelZoneAperture; "
+            f"for a {type(mask).__name__} use {other_models(mask)}"
+        )
     if method.model not in SAMPLED:
         counted = method.nodes or method.model != mask.exact_model or not method.pixel_integration
         if counted or has_few_terms(mask):

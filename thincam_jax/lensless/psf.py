@@ -29,7 +29,7 @@ from thincam_jax._core.precision import (
 )
 from thincam_jax._core.progress import watched
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
-from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, has_few_terms
 from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.closed_form import ChirpSum, closed_form, in_focus, paraxial
@@ -43,7 +43,7 @@ from thincam_jax.lensless.propagation.separable import (
     separable_image,
 )
 from thincam_jax.lensless.propagation.skew import skew_image
-from thincam_jax.lensless.resolve import require_factored, resolve
+from thincam_jax.lensless.resolve import resolve
 
 # Samples along an axis of the programs of closed forms, and of each more.
 _FEW, _STEP = 256, 1024
@@ -239,7 +239,8 @@ def _irradiance(
         if method.model == "separable" and path.skew:
             return skew_image(mask, grid, path, nodes=nodes)
         if method.model == "separable" and not has_few_terms(mask):
-            return separable_image(require_factored(mask), grid, path, nodes=nodes)
+            assert isinstance(mask, AbstractFactoredMask)  # by `psf_method`
+            return separable_image(mask, grid, path, nodes=nodes)
         if method.model == "radial":
             return radial(mask, grid, path, method)
         return _closed(mask, grid, path, method)
@@ -255,7 +256,8 @@ def _closed(
         return geometric(mask, grid, path, pixel_integration=average)
     if model == "separable":
         nodes = method.nodes or PIXEL_NODES
-        return separable(require_factored(mask), grid, path, pixel_integration=average, nodes=nodes)
+        assert isinstance(mask, AbstractFactoredMask)  # by `psf_method`
+        return separable(mask, grid, path, pixel_integration=average, nodes=nodes)
     return paraxial(mask, path) if model == "paraxial" else closed_form(mask, path)
 
 

@@ -372,16 +372,6 @@ def convolution_cost(
 _SLOW = 1e10
 
 
-def require_factored(mask: AbstractMask) -> AbstractFactoredMask:
-    """The mask, or one line that says which models can be used without terms."""
-    if not isinstance(mask, AbstractFactoredMask):
-        raise TypeError(
-            "model 'separable' needs a mask of few separable terms, such as FresnelZoneAperture; "
-            f"for a {type(mask).__name__} use {other_models(mask)}"
-        )
-    return mask
-
-
 def resolve(
     camera: LenslessCamera,
     path: LightPath,
@@ -398,8 +388,6 @@ def resolve(
     mask, grid = camera.mask, camera.sensor.grid
     given = method = as_method(model, pixel_integration)
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
-    if method.model == "separable":
-        require_factored(mask)
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
     method = with_nodes(method, mask, grid, path)

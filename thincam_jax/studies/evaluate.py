@@ -20,7 +20,7 @@ from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.metrics.usaf import resolved_element, usaf_contrast
-from thincam_jax.imaging.scene import ImagePlane, Spectrum
+from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import electrons_per_unit, read_out
 from thincam_jax.imaging.targets.usaf import line_pair, usaf1951_elements
 from thincam_jax.lensless import forward
@@ -48,7 +48,7 @@ class Capture:
 
 def noise_free(study: Study, exposure: Exposure, *planes: ImagePlane) -> Array:
     """Light of the planes on the sensor, (*channel, y, x), without saturation."""
-    light, pixels = Spectrum(exposure.wavelength), study.pixel_integration
+    light, pixels = ((exposure.wavelength, 1.0),), study.pixel_integration
     method = PsfMethod(study.model, None, pixels, field_tolerance=study.field_tolerance)
     camera = study.camera(exposure)
     images = (forward.expose(camera, plane, light, method) for plane in planes)

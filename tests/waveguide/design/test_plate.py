@@ -64,7 +64,7 @@ def test_expected_error_is_that_of_the_exact_system(numbers):
     y, x = (np.fft.fftfreq(20, 15.0) for _ in range(2))
     spectrum = np.asarray(PowerLaw(2.5)(jnp.asarray(y[:, None] ** 2 + x**2), jnp.asarray(150.0)))
     correlation = np.fft.ifft2(spectrum).real
-    correlation *= VIEWING.variance / correlation[0, 0]
+    correlation *= 0.08 / correlation[0, 0]
     rows, columns = np.divmod(np.arange(100), 10)
     prior = correlation[rows[:, None] - rows, columns[:, None] - columns]
     noise = float(noise_variance(VIEWING, judged.light) / judged.light**2)

@@ -167,7 +167,7 @@ def axis_fields(
     g = factors.curvatures[:, None, None]
     origins = 0.0 if factors.origins is None else factors.origins
     lower, upper = edges[:-1] - origins, edges[1:] - origins
-    field = chirp_integral(g, b, factors.from_origins(x), lower, upper)
+    field = chirp_integral(g, b, x[:, None] - origins, lower, upper)
     field = (values[:, None] * field).sum(axis=-1)
     return field * as_complex(jnp.sqrt(path.magnification / (path.wavelength * path.distance)))
 
