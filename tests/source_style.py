@@ -142,15 +142,6 @@ def long_signatures(module: Module) -> Iterator[tuple[ast.FunctionDef, list[str]
                 yield node, names
 
 
-def star_imports(modules: list[Module]) -> list[str]:
-    return [
-        f"{module.path}:{line}: star import: name what is imported"
-        for module in modules
-        for line, name in module.imports
-        if name.split(".")[-1] == "*"
-    ]
-
-
 def long_modules(modules: list[Module]) -> list[str]:
     counts = [(module.path, len(module.text.splitlines())) for module in modules]
     return [
@@ -269,7 +260,6 @@ STYLE_RULES = (
     named_tuples,
     names_of_two_classes,
     many_parameters,
-    star_imports,
     long_modules,
     missing_docstrings,
     missing_annotations,
@@ -342,8 +332,6 @@ BROKEN_STYLE = [
         "class A:\n    a: int\n    def __init__(self, a, b, c, d, e, f, g): ...",
         "psf.py:3: __init__ has 7",
     ),
-    (star_imports, "lensless/psf.py", "from .camera import *", "star import"),
-    (star_imports, "lensless/psf.py", "from numpy import *", "star import"),
     (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
     (missing_docstrings, "lensless/psf.py", "x = 1", "begins with a docstring"),
     (missing_docstrings, "lensless/masks/__init__.py", "", "begins with a docstring"),

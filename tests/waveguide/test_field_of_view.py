@@ -117,8 +117,3 @@ def test_published_field_is_neither_the_crops_nor_horizontal():
 
 def test_a_plate_that_guides_nothing_has_no_field():
     assert field_of_view(thesis_camera((44, 44), angle=35.0)) == FieldOfView(0.0, 0.0)
-
-
-def test_orders_below_one_are_refused():
-    with pytest.raises(ValueError, match="orders = 0"):
-        field_of_view(setting.camera(), orders=0)

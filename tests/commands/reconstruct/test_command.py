@@ -10,27 +10,17 @@ import scipy.ndimage
 import skimage.transform
 import tifffile
 from commands.reconstruct import simulated
-from typer.testing import CliRunner
+from commands.test_cli import one_line, runner
 
 from helpers import shared_data
 from thincam_jax.commands import cli
 from thincam_jax.commands.reconstruct import run
-
-runner = CliRunner()
 
 
 def call(paths, out, *more, psf="psf", capture="capture"):
     given = {"--psf": paths[psf], "--capture": paths.get(capture, capture), "--out": out}
     command = [str(part) for pair in given.items() for part in pair]
     return runner.invoke(cli.app, ["reconstruct", *command, *map(str, more)])
-
-
-def one_line(result):
-    """The one line on stderr of a call that ended with exit code 2, without "thincam: "."""
-    assert result.exit_code == 2, result.output
-    assert "Traceback" not in result.output
-    (line,) = result.stderr.splitlines()
-    return line.removeprefix("thincam: ")
 
 
 def test_pixels_without_light_are_not_enough(grey, tmp_path):

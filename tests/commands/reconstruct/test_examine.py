@@ -6,20 +6,12 @@ import numpy as np
 import pytest
 import tifffile
 from commands.reconstruct import simulated
-from typer.testing import CliRunner
-
-from thincam_jax.commands import cli
-
-runner = CliRunner()
+from commands.test_cli import call
 
 
 @pytest.fixture
 def paths(tmp_path):
     return simulated.grey_files(tmp_path)
-
-
-def call(*words):
-    return runner.invoke(cli.app, [str(word) for word in words])
 
 
 def reconstruct(paths, out, *more, psf="psf", capture="capture"):

@@ -351,15 +351,6 @@ def test_text_of_the_configuration_is_escaped(run):
     assert "<p>A second note.</p>" in page
 
 
-def rows(page):
-    """Cells of all table rows, as text."""
-    cells = re.findall(r"<tr>(.*?)</tr>", page, re.DOTALL)
-    return [
-        [re.sub(r"<[^>]+>", " ", c).strip() for c in re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row)]
-        for row in cells
-    ]
-
-
 def method(psnr, published_psnr, resolved, published_resolved):
     chart = None if resolved is None else Resolved(0, 1, resolved, 1.0)
     return MethodScores(

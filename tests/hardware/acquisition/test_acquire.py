@@ -1,6 +1,5 @@
 """An acquisition takes the frames of its plan, and no others, whatever goes wrong."""
 
-import copy
 import dataclasses
 import errno
 import os
@@ -77,7 +76,7 @@ def test_every_step_has_its_frame(path):
     done = run(World(), path, progress=heard.append)
     assert done.complete and not done.recovered
     assert set(done.seconds) == {"move", "show", "flush", "trigger", "check", "keep"}
-    assert [now.done for now in heard] == list(range(1, 24)) and heard[-1].remaining == 0
+    assert [now.done for now in heard] == list(range(1, 24))
     taken = require_whole(path)
     assert taken.plan == PLAN and taken.bits == 12 and taken.sensor_shape == SHAPE
     assert taken.captures().shape == (20, *SHAPE) and taken.dark().shape == SHAPE
@@ -276,52 +275,6 @@ def test_the_same_capture_twice_is_refused(path, monkeypatch):
     with pytest.raises(IncompleteFrame, match="that of the pattern before, digit for digit"):
         run(world, path)
     monkeypatch.undo()
-    assert run(world, path).complete
-    require_whole(path)
-
-
-WRONG = {
-    "none": (lambda frame: None, IncompleteFrame, "its driver returned no frame, but None"),
-    "pixels": (lambda frame: frame.pixels, ProtocolError, "returned an array of uint16 of shape"),
-    "list": (lambda frame: altered(frame, pixels=[[1]]), ProtocolError, "no whole Frame"),
-    "number": (lambda frame: altered(frame, number=None), ProtocolError, "no whole Frame"),
-    "size": (
-        lambda frame: altered(frame, pixels=frame.pixels[1:]),
-        *(IncompleteFrame, r"the frame has the shape \(5, 9\), not \(6, 9\)"),
-    ),
-    "kind": (
-        lambda frame: altered(frame, pixels=frame.pixels.astype(float)),
-        *(ProtocolError, "a frame of 12 bits as float64"),
-    ),
-}
-
-
-def altered(frame, **parts):
-    """The frame with other parts, unchecked as those of a driver are."""
-    made = copy.copy(frame)
-    for name, part in parts.items():
-        object.__setattr__(made, name, part)
-    return made
-
-
-@pytest.mark.parametrize("kind", WRONG)
-def test_what_is_no_frame_is_one_line_and_nothing_is_lost(path, monkeypatch, kind):
-    wrong, error, message = WRONG[kind]
-    world, taken = World(), MemoryCamera.trigger_and_grab
-    count = iter(range(99))
-
-    def broken(self, timeout):
-        frame = taken(self, timeout)
-        return wrong(frame) if next(count) > 5 else frame
-
-    monkeypatch.setattr(MemoryCamera, "trigger_and_grab", broken)
-    with pytest.raises(error, match=message) as caught:
-        run(world, path)
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 250
-    monkeypatch.undo()
-    assert len(CaptureStore(path).digests) == len(PLAN.steps)
-    with pytest.raises(CaptureStoreError, match="18 of 23 frames are missing"):
-        Acquisition.load(path)
     assert run(world, path).complete
     require_whole(path)
 

@@ -272,13 +272,6 @@ def test_reasons_name_all_that_is_left_out(distance, pitch, beta, width, toleran
     assert all("\n" not in sentence for sentence in choice.reasons)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, -1e-3, math.nan, math.inf])
-def test_tolerance_out_of_range(tolerance):
-    with pytest.raises(ValueError, match="^tolerance") as error:
-        select(camera_of(), tolerance)
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize("call", ["choose_model", "predict_error"])
 def test_traced_numbers_are_refused(call):
     """One line that says what to do."""

@@ -46,12 +46,11 @@ from thincam_jax.hardware.displays.settle import LONGEST, Shutter, settle_calibr
 
 @dataclass(frozen=True)
 class AcquisitionProgress:
-    """State after each frame: frames taken and in all, frames per second, and s remaining."""
+    """State after each frame: frames taken and in all, and frames per second."""
 
     done: int
     total: int
     rate: float
-    remaining: float
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def acquire(
                 done += 1
                 if progress is not None:
                     rate = count / max(time.monotonic() - started, 1e-9)
-                    progress(AcquisitionProgress(done, total, rate, (total - done) / rate))
+                    progress(AcquisitionProgress(done, total, rate))
     found = []
     if procedure.exposure == "auto":
         found.append(f"exposure {1000 * settings[0].exposure:.4g} ms")

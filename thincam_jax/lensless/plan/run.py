@@ -24,13 +24,12 @@ from thincam_jax.lensless.resolve import Cost
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect of the camera and whether the plan models it.
+    """An effect that the plan leaves out or, as a note says, models.
 
     - `size`: relative to the capture; None where it is not known.
     """
 
     name: str
-    modelled: bool
     size: float | None
     note: str
 
@@ -53,13 +52,13 @@ def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> E
     finest = camera.mask.finest_frequency
     if finest is None:
         note = "size not known for this mask: compare psf(..., at=(y, x)) with that of the axis"
-        return Effect("shift-variance", False, None, note)
+        return Effect("shift-variance", None, note)
     slope = max(math.hypot(p.height, p.width) / 2 / float(p.distance) for p in scene.planes)
     wavelength = float(max(scene.spectrum.wavelengths))
     size = psf_change(wavelength, float(camera.distance), float(finest), math.cos(math.atan(slope)))
     what = f"the PSF at {math.degrees(math.atan(slope)):.0f}° against the axis"
     verdict = "matters: see PsfMethod's field_tolerance" if size > tolerance else "does not matter"
-    return Effect("shift-variance", False, size, f"{what}: about {size:.1e}, {verdict}")
+    return Effect("shift-variance", size, f"{what}: about {size:.1e}, {verdict}")
 
 
 def _obliquity(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect:
@@ -72,9 +71,7 @@ def _obliquity(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect
         )
         falls.append(np.mean((1 - np.asarray(light_over_field(camera.sensor, y, x))) ** 2))
     size = math.sqrt(float(np.mean(falls)))
-    return Effect(
-        "obliquity", False, size, _left_out(size, tolerance, "fall of light over the field")
-    )
+    return Effect("obliquity", size, _left_out(size, tolerance, "fall of light over the field"))
 
 
 def _left_out(size: float, tolerance: float, what: str) -> str:
@@ -87,26 +84,26 @@ def _shot_noise(camera: LenslessCamera, tolerance: float) -> Effect:
     sensor = camera.sensor
     if sensor.electrons is not None:
         note = "size not known: the brightest pixel depends on the scene's light"
-        return Effect("shot noise", False, None, note)
+        return Effect("shot noise", None, note)
     if sensor.exposure is None:
         note = "size not known: give the Sensor an exposure, such as 0.9"
-        return Effect("shot noise", False, None, note)
+        return Effect("shot noise", None, note)
     size = 1 / math.sqrt(float(sensor.exposure * sensor.full_well))
     what = "matters: pass noise=PoissonGaussianNoise()" if size > tolerance else "does not matter"
-    return Effect("shot noise", False, size, f"about {size:.1e} a pixel, {what}")
+    return Effect("shot noise", size, f"about {size:.1e} a pixel, {what}")
 
 
 def _fresnel(camera, scene: Scene, tolerance: float) -> Effect:
     """Exact scalar diffraction against Fresnel's, for the nearest plane."""
     if not has_few_terms(camera.mask):
         if camera.mask.exact_model:
-            return Effect("exact phases", False, None, "Fresnel's; size not known for this mask")
-        return Effect("exact phases", True, None, "those of exact scalar diffraction are modelled")
+            return Effect("exact phases", None, "Fresnel's; size not known for this mask")
+        return Effect("exact phases", None, "those of exact scalar diffraction are modelled")
     distance = min(float(plane.distance) for plane in scene.planes)
     wavelength = max(float(w) for w in scene.spectrum.wavelengths)
     size = probe_of(camera, wavelength, distance, True).paraxial_error()
     note = _left_out(size, tolerance, "Fresnel's approximation of the PSF")
-    return Effect("exact phases", False, size, note)
+    return Effect("exact phases", size, note)
 
 
 # How far a camera's numbers may be from the plan's, relative.

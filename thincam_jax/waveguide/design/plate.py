@@ -145,14 +145,13 @@ class Judged(Module):
 
     - `error`: expected, as a part of the object's variance. `light`: mean weight ∑W_i, mm.
     - `field_of_view`: along y, rad, to the sensor's edges or to where the glass guides no light;
-      holograms are as large as that needs. `ghost`: mean distance of the first, mm on the object.
+      holograms are as large as that needs.
     - `ghost_light`: part of the light that comes by ghosts.
     """
 
     error: Float[Array, ""]
     light: Float[Array, ""]
     field_of_view: Float[Array, ""]
-    ghost: Float[Array, ""]
     ghost_light: Float[Array, ""]
 
 
@@ -192,10 +191,8 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     imaginary = jnp.sum(jnp.sum(jnp.sin(turns), axis=2) * shares, axis=0)
     known = density * (real**2 + imaginary**2) / noise
     error = jnp.mean(jnp.sum(density / (1 + known), axis=-1)) / jnp.sum(density)
-    middle = jnp.mean(rays.points, axis=2)
-    ghost = jnp.mean(jnp.sqrt(jnp.sum((middle[1] - middle[0]) ** 2, axis=-1)))
     behind = jnp.mean(jnp.sum(rays.weight[1:], axis=0)) / light
-    return Judged(error, light, _field_of_view(plate, viewing.sensor), ghost, behind)
+    return Judged(error, light, _field_of_view(plate, viewing.sensor), behind)
 
 
 def _field_of_view(plate: Plate, sensor: Sensor) -> Float[Array, ""]:
