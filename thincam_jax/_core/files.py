@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import stat
 import zipfile
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ import numpy as np
 
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.text import escaped
+
+_PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
 class MeasurementError(ValueError):
@@ -131,3 +134,22 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _ADVICE = dict.fromkeys(_FULL, "make room or give another folder")
 _ADVICE[errno.ENOENT] = "make its folder first, or give another"
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # not on every system
+
+
+def natural_order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Key by which capture_9 comes before capture_10."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
+
+
+def photograph_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """Files of photographs in a folder, in natural order, no hidden ones; ValueError for none."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"{str(folder)!r} is no folder; give a folder of images")
+    there = (one for one in folder.iterdir() if one.suffix.lower() in _PHOTOGRAPHS)
+    files = sorted((one for one in there if one.name[0] != "."), key=natural_order)
+    if not files:
+        known = ", ".join(_PHOTOGRAPHS)
+        raise ValueError(f"{str(folder)!r} holds no image; give a folder of {known}")
+    return files

@@ -26,20 +26,20 @@ from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.learn.trained import PhysicsStep, TrainedReconstruction, cleaned, refined
 from thincam_jax.learn.trained_lessons import CameraLessons, PairLessons, PreparedExamples
 from thincam_jax.learn.training import (
+    NETWORK,
     Task,
     Trained,
+    TrainingFiles,
     TrainingOptions,
     TrainingProgress,
     TrainingState,
-    read_state,
     train_model,
-    write_state,
 )
 from thincam_jax.reconstruction.problem import InverseProblem, or_one
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.studies.agreement import agreement
 
-NETWORK, STATE = "network.thincam", "training.state"
+STATE = "training.state"
 # Of the seeds: captures that fit the physics step, that train, and that judge.
 _FITTING, _TRAINING, _JUDGING = 0, 1, 2
 _LEAST = 1e-5  # of the squared error: 50 dB
@@ -181,9 +181,7 @@ def train_reconstruction(
     **Arguments**
 
     - `untrained`: new, or trained before, for other captures of the camera.
-    - `folder`: holds `network.thincam`, the best until now, and `training.state`; both are written
-      at each check, whole or not at all. Training goes on from a state that is there, and ends
-      with the same bits as without the interruption, on one machine.
+    - `folder`: holds `network.thincam` and `training.state`; see `TrainingFiles`.
 
     **Errors**: CheckpointError, one line, for a state that is damaged or of another training.
     """
@@ -192,17 +190,15 @@ def train_reconstruction(
         physics = TrainedReconstruction.load(path.with_name(NETWORK)).physics
     else:
         physics = lessons.fit(untrained.physics, options.seed)
-    made = dataclasses.replace(untrained, physics=physics)
-    task, keep = lessons.task(physics, options.seed), None
-    state = begun = TrainingState.begin(made.network, task, options)
+    made, train = dataclasses.replace(untrained, physics=physics), train_model
     if path is not None:
         record = described(lessons, options)
         camera = "" if made.camera is None else made.camera.digest
         settings = {"sizes": dataclasses.asdict(made.options), "camera": camera, **record}
-        if path.exists():
-            state = read_state(path, begun, settings)
-        keep = functools.partial(_keep, path, made, settings, record)
-    trained = train_model(task, made.network, options, state=state, keep=keep, callback=callback)
+        save = functools.partial(_save, path.with_name(NETWORK), made, record)
+        train = TrainingFiles(path, settings, save).train
+    task = lessons.task(physics, options.seed)
+    trained = train(task, made.network, options, callback=callback)
     # The arrays of a state that was read are NumPy's.
     whole_model = dataclasses.replace(made, network=jax.tree.map(jnp.asarray, trained.model))
     return Trained(whole_model, trained.state, trained.status)
@@ -240,10 +236,7 @@ def described(lessons: ReconstructionLessons, options: TrainingOptions) -> dict[
     }
 
 
-def _keep(path: Path, made: TrainedReconstruction, settings, record, state: TrainingState) -> None:
-    """Write the best network with its training record, and the state from which to resume."""
-    scores = [round(float(score), 5) for score in state.scores if score == score]
+def _save(path: Path, made: TrainedReconstruction, record, state: TrainingState) -> None:
+    """Write the best network with its training record."""
     best = dataclasses.replace(made, network=state.best)
-    best.save(path.parent / NETWORK, {**record, **state.counts, "scores": scores})
-    # Last: it is what training goes on from.
-    write_state(path, state, settings)
+    best.save(path, {**record, **state.record})

@@ -34,6 +34,7 @@ _IN_A_ROW, _MOST_RETREATS = 3, 4
 # Steps whose times tell what is left.
 _RECENT = 20
 _COUNTS = ("step", "skipped", "retreats")
+NETWORK = "network.thincam"  # the best one until now, in the folder of a training
 
 TrainingStatus = Literal["finished", "stopped", "diverged"]
 
@@ -115,6 +116,12 @@ class TrainingState(eqx.Module):
     def counts(self) -> dict[str, int]:
         """Steps done, steps that changed nothing, and retreats, for records of the training."""
         return {"steps": self.step, "skipped": self.skipped, "retreats": self.retreats}
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The counts, and the scores until now."""
+        scores = [round(float(score), 5) for score in self.scores if score == score]
+        return {**self.counts, "scores": scores}
 
     @classmethod
     def begin(cls, model: Any, task: Task, options: TrainingOptions) -> "TrainingState":
@@ -213,6 +220,32 @@ def train_model(
                 status = "stopped"
                 break
     return Trained(eqx.combine(state.best, fixed), state, status)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingFiles:
+    """Files that a training goes on from, written at each check, whole or not at all.
+
+    - `state`: path of the state, which belongs to the `settings`. From one that is there training
+      ends with the same bits as without the interruption, on one machine.
+    - `save`: writes the best network of a state.
+    """
+
+    state: Path
+    settings: dict[str, Any]
+    save: Callable[[TrainingState], object]
+
+    def keep(self, state: TrainingState) -> None:
+        """Write the network, and last the state: it is what training goes on from."""
+        self.save(state)
+        write_state(self.state, state, self.settings)
+
+    def train(self, task: Task, model: Any, options: TrainingOptions, callback: Any) -> Trained:
+        """`train_model`; CheckpointError for a state that is damaged or of another training."""
+        state = TrainingState.begin(model, task, options)
+        if self.state.exists():
+            state = read_state(self.state, state, self.settings)
+        return train_model(task, model, options, state=state, keep=self.keep, callback=callback)
 
 
 def write_state(

@@ -20,17 +20,11 @@ from typing import Any
 
 import yaml
 
-from thincam_jax._core.files import file_digest, read_regular
+from thincam_jax._core.files import file_digest, natural_order, read_regular
 from thincam_jax._core.text import shortened
 from thincam_jax.measured.pairs import Pairs, Stored, TruthAlignment
 from thincam_jax.measured.raw import MeasurementError
-from thincam_jax.measured.read import (
-    SUFFIXES,
-    image_files,
-    natural_order,
-    read_image,
-    read_photograph,
-)
+from thincam_jax.measured.read import SUFFIXES, image_files, read_image, read_photograph
 
 _FOLDERS = (
     *(("captures", "truths"), ("lensless", "lensed"), ("measured", "original")),

@@ -18,7 +18,7 @@ import tifffile
 from jaxtyping import Bool
 
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.files import open_regular
+from thincam_jax._core.files import natural_order, open_regular
 from thincam_jax._core.image_files import (
     RAW_SUFFIXES,
     ImageFileError,
@@ -203,12 +203,6 @@ def pair_backgrounds(captures: Sequence[Path], folder: Any) -> list[Path]:
             "named as one; name all as their captures, give as many, or one file for all"
         )
     return alike or list(named.values())
-
-
-def natural_order(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Key by which capture_9 comes before capture_10."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
 
 
 def _decode(

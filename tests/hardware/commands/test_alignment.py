@@ -127,7 +127,7 @@ def test_photographs_become_pairs_of_captures_and_truths(aligned):
         (["optics=null"], "optics: a plan of kind alignment needs optics"),
         (["alignment=a.json"], "alignment: a plan of kind alignment takes none; drop it"),
         ([f"plan={json.dumps(PICTURES)}"], "alignment: a plan of kind pictures with optics"),
-        (["photographs=nowhere"], "photographs: 'nowhere' holds no photograph; give a folder"),
+        (["photographs=nowhere"], "photographs: 'nowhere' is no folder; give a folder of"),
         (["held_out=1"], "held_out: this file makes 0 pairs; give fewer, or drop it"),
         (["plan.betas=[60 rad/mm^2, 50 rad/mm^2]"], "plan.betas: a plan of kind alignment has one"),
     ],

@@ -3,13 +3,13 @@
 import functools
 from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import pydantic
 from pydantic import BeforeValidator, Field
 
+from thincam_jax._core.files import photograph_files
 from thincam_jax._core.quantity import FieldError
 from thincam_jax._core.text import slug
 from thincam_jax.commands.kinds import section_of
@@ -34,7 +34,6 @@ from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model
-from thincam_jax.measured.read import natural_order
 
 if TYPE_CHECKING:
     from thincam_jax.waveguide.commands.config import SeeThroughConfig
@@ -42,19 +41,6 @@ else:
     SeeThroughConfig = section_of("waveguide", "config:SeeThroughConfig")
 
 Count = Annotated[int, Field(ge=1, le=65536)]
-
-
-_PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-
-
-def photograph_files(folder: str) -> list[Path]:
-    """Files of photographs in a folder, in the order of their numbers; ValueError for none."""
-    there = Path(folder).iterdir() if Path(folder).is_dir() else ()
-    files = [one for one in there if one.suffix.lower() in _PHOTOGRAPHS and one.name[0] != "."]
-    if not files:
-        known = ", ".join(_PHOTOGRAPHS)
-        raise ValueError(f"{folder!r} holds no photograph; give a folder of {known}")
-    return sorted(files, key=natural_order)
 
 
 class DeviceConfig(Section):

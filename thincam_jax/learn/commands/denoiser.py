@@ -1,6 +1,6 @@
 """Experiment files of `kind: denoiser`: pictures, a network and its training in a folder."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -106,21 +106,28 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
 
 def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
     """**Errors**: ConfigError, one line for each source that cannot be read."""
+    train, judge = read_pictures(config, pictures)
+    return config.training.build(DenoisingLessons, pictures=train, held_out=judge)
+
+
+def read_pictures(config: Any, maker: Any) -> tuple[Pictures, Pictures | None]:
+    """Pictures of all sources to train on, by functions of a module, and those that judge.
+
+    **Errors**: ConfigError, one line for each source that cannot be read.
+    """
     train: list[Pictures] = []
     judge: list[Pictures] = []
 
     def read(source: PicturesConfig) -> tuple[list[Pictures], list[Pictures]]:
-        images = source.images(pictures)
+        images = source.images(maker)
         named = images if isinstance(images, dict) else {source.name: images}
         return pictures.split(named, source.held_out)
 
-    for source, (kept, held_out) in zip(
-        config.sources, config.read_all("sources", read), strict=True
-    ):
+    read_all = config.read_all("sources", read)
+    for source, (kept, held_out) in zip(config.sources, read_all, strict=True):
         (train if source.use == "train" else judge).extend(kept)
         judge.extend(held_out)
     if not train:
         place = config.place_of("sources")
         raise ConfigError(f"{place}sources: none is left to train on; give one")
-    held_out = united(judge) if judge else None
-    return config.training.build(DenoisingLessons, pictures=united(train), held_out=held_out)
+    return united(train), united(judge) if judge else None

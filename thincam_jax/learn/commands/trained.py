@@ -20,9 +20,8 @@ from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.schema import Section, section
 from thincam_jax.learn import trained_lessons
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.commands.denoiser import PicturesConfig
+from thincam_jax.learn.commands.denoiser import PicturesConfig, read_pictures
 from thincam_jax.learn.commands.training import TRAINING, Ended, InFolder, LearningConfig
-from thincam_jax.learn.denoiser.pictures import Pictures, split, united
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.plot import draw_losses
 from thincam_jax.learn.refocusing.learned import finite
@@ -167,15 +166,16 @@ def build_untrained(config: TrainedConfig, lessons: ReconstructionLessons) -> Tr
 
 def build_lessons(config: TrainedConfig) -> ReconstructionLessons:
     """**Errors**: ConfigError, one line for each file that cannot be read."""
-    train, judge = _pictures(config)
+    train, judge = read_pictures(config, trained_lessons)
+    judge = judge or train
     try:
         ready = Inputs(config.psf.sources()).prepare(Path(config.psf.path))
     except (MeasurementError, OSError) as error:
         raise ConfigError(f"{config.place_of('psf')}psf: {error}") from None
     rows, columns = ready.capture.shape[-2:]
     faults = config.faults.build()
-    made = [CameraLessons(ready.psf, (rows, columns), united(p), faults) for p in (train, judge)]
-    images = {"trained on": united(train).manifest, "judged on": united(judge).manifest}
+    made = [CameraLessons(ready.psf, (rows, columns), p, faults) for p in (train, judge)]
+    images = {"trained on": train.manifest, "judged on": judge.manifest}
     parts: dict[str, Any] = {"judge": made[1]}
     if config.pairs is not None:
         parts["train"], parts["judge"] = _pairs(config)
@@ -185,25 +185,6 @@ def build_lessons(config: TrainedConfig) -> ReconstructionLessons:
     except FieldError as error:
         place = config.place_of("training", error.field)
         raise ConfigError(f"{place}training.{error}") from None
-
-
-def _pictures(config: TrainedConfig) -> tuple[list[Pictures], list[Pictures]]:
-    """Pictures to train on, and those that judge; by default the same."""
-    train: list[Pictures] = []
-    judge: list[Pictures] = []
-
-    def read(source: PicturesConfig) -> tuple[list[Pictures], list[Pictures]]:
-        images = source.images(trained_lessons)
-        named = images if isinstance(images, dict) else {source.name: images}
-        return split(named, source.held_out)
-
-    read_all = config.read_all("sources", read)
-    for source, (kept, held_out) in zip(config.sources, read_all, strict=True):
-        (train if source.use == "train" else judge).extend(kept)
-        judge.extend(held_out)
-    if not train:
-        raise ConfigError(f"{config.place_of('sources')}sources: none is left to train on")
-    return train, judge or train
 
 
 def _pairs(config: TrainedConfig) -> tuple[PairLessons, PairLessons]:

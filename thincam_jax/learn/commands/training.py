@@ -14,8 +14,7 @@ from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sections import ExperimentConfig, Name, check_keys, check_names
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.refocusing.train import NETWORK
-from thincam_jax.learn.training import Trained, TrainingOptions, TrainingProgress
+from thincam_jax.learn.training import NETWORK, Trained, TrainingOptions, TrainingProgress
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 TRAINING = ("steps", "rate", "warm_up", "averaging", "check_every")

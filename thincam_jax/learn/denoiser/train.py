@@ -24,17 +24,17 @@ from thincam_jax.learn.denoiser.reconstructions import (
 )
 from thincam_jax.learn.refocusing.sources import Entry, as_json
 from thincam_jax.learn.training import (
+    NETWORK,
     Task,
     Trained,
+    TrainingFiles,
     TrainingOptions,
     TrainingProgress,
     TrainingState,
-    read_state,
     train_model,
-    write_state,
 )
 
-NETWORK, STATE = "network.thincam", "training.state"
+STATE = "training.state"
 # Of the seed's key: the crops that judge a network.
 _JUDGED = 2**31
 
@@ -96,26 +96,21 @@ def train_denoiser(
 
     **Arguments**
 
-    - `folder`: holds `network.thincam`, the best until now, and `training.state`; both are written
-      at each check, whole or not at all. Training goes on from a state that is there, and ends
-      with the same bits as without the interruption, on one machine.
+    - `folder`: holds `network.thincam` and `training.state`; see `TrainingFiles`.
 
     **Errors**: CheckpointError, one line, for a state that is damaged or of another training.
     """
-    network = jax.tree.map(jnp.asarray, network)
-    task, keep = lessons.task(options.seed), None
-    state = begun = TrainingState.begin(network, task, options)
+    network, train = jax.tree.map(jnp.asarray, network), train_model
+    task = lessons.task(options.seed)
     if folder is not None:
         widths, blocks = network.shape
         record = _described(lessons, options)
         settings = {"widths": widths, "blocks": blocks, **record}
-        path = Path(folder) / STATE
-        before = 0.0
-        if path.exists():
-            state = read_state(path, begun, settings)
-            before = _seconds(path.with_name(NETWORK))
-        keep = functools.partial(_keep, path, settings, record, before - time.process_time())
-    return train_model(task, network, options, state=state, keep=keep, callback=callback)
+        state, path = Path(folder) / STATE, Path(folder) / NETWORK
+        before = (_seconds(path) if state.exists() else 0.0) - time.process_time()
+        save = functools.partial(_save, path, record, before)
+        train = TrainingFiles(state, settings, save).train
+    return train(task, network, options, callback=callback)
 
 
 def _described(lessons: DenoisingLessons, options: TrainingOptions) -> dict[str, Any]:
@@ -133,11 +128,7 @@ def _seconds(path: Path) -> float:
         return 0.0
 
 
-def _keep(path: Path, settings, record, before: float, state: TrainingState) -> None:
-    """Write the best network with its training record, and the state from which to resume."""
-    scores = [round(float(score), 5) for score in state.scores if score == score]
+def _save(path: Path, record, before: float, state: TrainingState) -> None:
+    """Write the best network with its training record."""
     seconds = round(before + time.process_time(), 1)
-    known = {**record, **state.counts, "scores": scores, "cpu_seconds": seconds}
-    Denoiser(state.best).save(path.parent / NETWORK, known)
-    # Last: it is what training goes on from.
-    write_state(path, state, settings)
+    Denoiser(state.best).save(path, {**record, **state.record, "cpu_seconds": seconds})

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from thincam_jax._core.files import file_digest, read_regular
+from thincam_jax._core.files import file_digest, photograph_files, read_regular
 from thincam_jax.imaging.encoding import decode_srgb
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.imaging.targets.images import load_image
@@ -72,7 +72,6 @@ def _drop(image: np.ndarray, rng: np.random.Generator, radius: float) -> None:
     part += cover * (np.clip(colour, 0, 1).astype(np.float32) - part)
 
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 # Photographs that ship with scikit-image.
 _SAMPLES = (
     *("astronaut", "brick", "camera", "chelsea", "coffee", "coins", "grass", "gravel"),
@@ -125,13 +124,8 @@ def read_photographs(
     folder: str | os.PathLike[str], licence: str = ""
 ) -> list[tuple[np.ndarray, Entry]]:
     """The images of a folder as in their files, from 0 to 1; see `photographs`."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ValueError(f"{str(folder)!r} is no folder; give a folder of images")
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
-    if not files:
-        raise ValueError(f"{str(folder)!r} holds no image; give a folder of {', '.join(_SUFFIXES)}")
-    licence = licence or _licence(folder)
+    files = photograph_files(folder)
+    licence = licence or _licence(Path(folder))
     entries = [Entry(path.name, file_digest(path), licence) for path in files]
     return [
         (load_image(path, linear=True), entry) for path, entry in zip(files, entries, strict=True)

@@ -24,14 +24,14 @@ from thincam_jax.learn.refocusing.sources import Entry, Source, as_json
 from thincam_jax.learn.refocusing.store import described
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.learn.training import (
+    NETWORK,
     Task,
     Trained,
+    TrainingFiles,
     TrainingOptions,
     TrainingProgress,
     TrainingState,
-    read_state,
     train_model,
-    write_state,
 )
 
 Parts = dict[str, Float[Array, ""]]
@@ -134,7 +134,7 @@ def relative_error(image: Array, target: Array) -> Float[Array, ""]:
     return jnp.log(ratio + _LEAST) / 2
 
 
-NETWORK, STATE = "network.thincam", "training-{}.state"
+STATE = "training-{}.state"
 # Of the seed's key: scenes of the pools have the numbers of their batches.
 _JUDGED = 2**31
 
@@ -219,9 +219,7 @@ def train(
 
     **Arguments**
 
-    - `folder`: holds `network.thincam`, the best until now, and a state for each U-Net; they are
-      written at each check, whole or not at all. Training goes on from states that are there, and
-      ends with the same bits as without the interruption, on one machine.
+    - `folder`: holds `network.thincam` and a state for each U-Net; see `TrainingFiles`.
 
     **Errors**: CheckpointError, one line, for a state that is damaged or of another training.
     """
@@ -235,18 +233,15 @@ def train(
     }
     losses, scores, trained = [], [], None
     for number in range(count):
-        part = network.first(number + 1)
-        task, prior = lessons.task(part, options.seed), part.weights.prior[number]
-        state = begun = TrainingState.begin(prior, task, each)
-        keep = tell = None
+        part, go, tell = network.first(number + 1), train_model, None
         if folder is not None:
-            path, own = Path(folder) / STATE.format(number + 1), {**settings, "step": number}
-            keep = functools.partial(_keep, path, part, own, record)
-            if path.exists():
-                state = read_state(path, begun, own)
+            save = functools.partial(_save, Path(folder) / NETWORK, part, record)
+            own, state = {**settings, "step": number}, Path(folder) / STATE.format(number + 1)
+            go = TrainingFiles(state, own, save).train
         if callback is not None:
             tell = functools.partial(_tell, callback, number, count, time.perf_counter())
-        trained = train_model(task, prior, each, state=state, keep=keep, callback=tell)
+        task, prior = lessons.task(part, options.seed), part.weights.prior[number]
+        trained = go(task, prior, each, callback=tell)
         network = network.with_prior(number, trained.model)
         losses.append(trained.state.losses[: trained.state.step])
         scores.append(trained.state.scores)
@@ -266,14 +261,11 @@ def _described(lessons: Lessons, options: TrainingOptions) -> dict[str, Any]:
     return {"images": as_json(lessons.images), **drawn, **described}
 
 
-def _keep(path: Path, network: RefocusNetwork, settings, record, state: TrainingState) -> None:
-    """Writes what is to be kept of the training of a network's last U-Net."""
+def _save(path: Path, network: RefocusNetwork, record, state: TrainingState) -> None:
+    """Write the network with its best last U-Net, and its training record."""
     number = network.options.steps - 1
     best = network.with_prior(number, eqx.combine(state.best, network.weights.prior[number]))
-    scores = [float(score) for score in state.scores if score == score]
-    best.save(path.parent / NETWORK, {**record, "scores": scores, **state.counts})
-    # Last: it is what training goes on from.
-    write_state(path, state, settings)
+    best.save(path, {**record, **state.record})
 
 
 def _tell(callback, number: int, parts: int, began: float, progress: TrainingProgress) -> object:
