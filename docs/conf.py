@@ -150,6 +150,7 @@ MODULES = (
     "reconstruction.solver",
     "studies.design",
     "studies.evaluate",
+    "studies.intervals",
     "studies.prepared",
     "waveguide.colours",
     "waveguide.distance",

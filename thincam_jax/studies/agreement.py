@@ -16,6 +16,7 @@ from thincam_jax._core.table import Cell, Table, number
 from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.metrics.image import fit_levels
+from thincam_jax.studies.intervals import PixelSample, cross_validated
 
 Fit = Literal["levels", "gain", "maximum", "none"]
 FITS: dict[Fit, str] = {
@@ -157,6 +158,8 @@ class MethodSummary:
 
     - `beside`: PSNR less that of the first method in the same images. `seconds`: median.
     - `failed`: images that could not be reconstructed. `worst`, `median`, `best`: PSNR, dB.
+    - `covered`, `width`: share of the truth's pixels in intervals of 90 % that other images
+      calibrated, and mean width of these; see `studies.intervals` for their unit.
     """
 
     method: str
@@ -170,6 +173,8 @@ class MethodSummary:
     ssim: Mean | None
     residual: Mean | None
     seconds: float | None
+    covered: Mean | None = None
+    width: Mean | None = None
 
 
 def summarised(
@@ -191,7 +196,8 @@ def summarised(
         seconds = float(np.median([row["seconds"] for row in own.values()])) if own else None
         beside = None if method == methods[0] else mean_of(gains)
         counts = len(own), failed.get(method, 0)
-        scores = mean_of(psnrs), beside, worst, median, best, similar, left, seconds
+        held = [mean_of(one) for one in cross_validated(PixelSample.of_rows(own.values()))]
+        scores = mean_of(psnrs), beside, worst, median, best, similar, left, seconds, *held
         found.append(MethodSummary(method, *counts, *scores))
     return tuple(found)
 
@@ -213,9 +219,13 @@ def scores_table(scores: Sequence[MethodSummary], brief: bool = False) -> Table:
         ),
         "residual": (4, [one.residual and one.residual.mean for one in scores]),
         "seconds": (2, [one.seconds for one in scores]),
+        "in intervals\nof 90 %": (3, [one.covered and one.covered.words(3) for one in scores]),
+        "their\nwidth": (3, [one.width and one.width.words(3) for one in scores]),
     }
-    alone = ("beside\nthe first",) if len(scores) == 1 else ()
-    for name in (*alone, *(("images", "failed", "median", "best") if brief else ())):
+    unknown = ("in intervals\nof 90 %", "their\nwidth")
+    left_out = ("beside\nthe first",) if len(scores) == 1 else ()
+    left_out += () if any(one.covered for one in scores) else unknown
+    for name in {*left_out, *(("images", "failed", "median", "best", *unknown) if brief else ())}:
         del columns[name]
     digits, cells = zip(*columns.values(), strict=True)
     return Table(tuple(columns), list(zip(*cells, strict=True)), digits=digits[1:])

@@ -25,6 +25,7 @@ from thincam_jax.commands.evaluate.pair import opened, reconstructed
 from thincam_jax.measured import Preparation
 from thincam_jax.measured.layouts import open_pairs
 from thincam_jax.studies.agreement import agreement
+from thincam_jax.studies.intervals import Intervals, PixelSample
 
 LINEAR = ("--bits", 12, "--background", simulated.DARK)
 
@@ -58,7 +59,9 @@ def fast(monkeypatch):
             warnings.warn("a corner is not dark", stacklevel=1)
         seed = sum(map(ord, method + given.name))
         noise = np.random.default_rng(seed).normal(0, 0.1, given.truth.shape).astype(np.float32)
-        return agreement(given.truth + noise, given.truth), 0.5, others
+        image = given.truth + noise
+        pixels = PixelSample.of(3 * image, given.truth, 64).as_lists()
+        return agreement(image, given.truth), 0.5, {**others, "pixels": pixels}
 
     monkeypatch.setattr(pair, "reconstructed", noisy)
 
@@ -184,6 +187,27 @@ class TestEvaluate:
         order = sorted((float(r["psnr_db"]), r["name"]) for r in rows if r["method"] == "admm_tv")
         assert f"Worst: {order[0][1]}" in page and f"Best: {order[-1][1]}" in page
         assert np.asarray(PIL.Image.open(out / "images" / "best-truth.png")).max() == 231  # of 0.8
+
+    def test_intervals_of_twelve_pairs(self, folder, tmp_path, done, fast):
+        """Each pair's are calibrated by others; those of all are kept, for images of the camera."""
+        for place, end in (("captures", "tif"), ("truths", "npy")):
+            for n in range(4, 12):
+                source = folder / place / f"im{n % 4}.{end}"
+                (folder / place / f"im{n}.{end}").write_bytes(source.read_bytes())
+        out = tmp_path / "out"
+        assert self.run(folder, out, "--method", "ridge", "--limit", 11).exit_code == 0
+        (scores,) = json.loads((out / "metrics.json").read_text())["scores"]
+        assert scores["covered"] is None and not list(out.glob("intervals/*"))
+        column = re.compile("in intervals.{0,9}of 90 %", re.DOTALL)
+        assert not column.search((out / "report.html").read_text())
+        assert self.run(folder, out, "--method", "ridge").exit_code == 0
+        (scores,) = json.loads((out / "metrics.json").read_text())["scores"]
+        assert 0.9 < scores["covered"]["mean"] <= 1
+        # Noise of 0.1, of whose pixels nine pictures leave at most one out on average.
+        assert 0.3 < scores["width"]["mean"] < 1
+        assert column.search((out / "report.html").read_text())
+        found = Intervals.load(out / "intervals" / "ridge.json")
+        assert found.pictures == 12 and found.levels == "own" and found.probability == 0.9
 
     def test_goes_on(self, folder, tmp_path, done, fast):
         out, method = tmp_path / "out", ("--method", "ridge")
@@ -319,4 +343,6 @@ def test_500_pairs_killed_ten_times(tmp_path):
     assert kept == sorted(kept) and kept[-1] < 500
     assert begin(killed).wait() == 0
     assert rows_of(killed) == rows_of(tmp_path / "whole")
+    intervals = [tmp_path / name / "intervals/ridge.json" for name in ("killed", "whole")]
+    assert intervals[0].read_bytes() == intervals[1].read_bytes()
     assert not list(killed.rglob("*.partial"))

@@ -20,6 +20,10 @@ from thincam_jax.studies.agreement import FITS, scores_table
 if TYPE_CHECKING:
     from thincam_jax.commands.evaluate.run import Evaluated
 
+_UNITS = (
+    "parts of the truth's full scale, by one gain and offset for all images",
+    "parts of the image's range, from the 1st to the 99th percentile, its gain and offset fitted",
+)
 _NEEDED = ("dataset", "method", "protocol", "source")
 _MOST = 10  # failures, and findings, that a page lists
 
@@ -40,6 +44,8 @@ def whole_page(
         f"{ENCODINGS[pairs.encoding]}.",
         f"Levels: {FITS[config.fit]}.",
         f"Place: {pairs.alignment}; the image is {shift}.",
+        "Intervals of 90 % about each pixel are calibrated by other images, and hold on average: a "
+        f"single image may have fewer inside. Their width is in {_UNITS[config.fit == 'levels']}.",
         "Means have their interval of 95 % over the images, by Student's t. The residual is that "
         "of the capture, ‖Hf − g‖/‖g‖. Seconds are the median's.",
         "Images are those of `thincam reconstruct` with the same options.",

@@ -24,10 +24,12 @@ from thincam_jax.measured.merging import without_hot_pixels
 from thincam_jax.measured.pairs import PairedCapture, Pairs, relative_pitch
 from thincam_jax.measured.preparation import Prepared
 from thincam_jax.studies.agreement import Agreement, agreement
+from thincam_jax.studies.intervals import Levels, PixelSample
 from thincam_jax.studies.prepared import check_channels, pixel_noise, reconstruct_prepared
 
 # Part of every key: to be raised when the same files and options are to give other scores.
-SCORES_VERSION = 1
+SCORES_VERSION = 2
+_PIXELS = 256  # of a picture, by which intervals are calibrated
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,9 @@ def reconstructed(
         raise MeasurementError(f"{pair.name}: the image became NaN or infinite")
     both = pairs.alignment.matched(done.image(), pair.truth, ready.log)
     found = agreement(*both, fit=asked.fit, shift=asked.shift)
-    others = {"residual": done.relative_residual, "status": done.found.status}
+    levels: Levels = "own" if asked.fit == "levels" else "common"
+    pixels = PixelSample.of(*both, _PIXELS, levels).as_lists()
+    others = {"residual": done.relative_residual, "status": done.found.status, "pixels": pixels}
     findings = [str(one) for one in (*examined.findings, done.found.reason) if str(one)]
     return found, done.found.seconds, {**others, "findings": findings}
 

@@ -21,6 +21,7 @@ from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.commands.sweep.workers import Died, Outcomes, Progress, tried_twice, workers_of
 from thincam_jax.measured.pairs import Pairs
 from thincam_jax.studies.agreement import MethodSummary, summarised
+from thincam_jax.studies.intervals import Intervals, PixelSample
 
 _COLUMNS = (
     *("number", "name", "method", "psnr_db", "ssim", "residual", "status", "gain", "offset"),
@@ -35,10 +36,12 @@ class EvaluationFolder(RunFolder):
       digest of all that they depend on, or why there are none. Other methods and more pairs with
       the same options join them.
     - `table.csv`: a row for each pair and method. `images/`: worst, median and best.
+    - `intervals/METHOD.json`: see `studies.intervals`; of twelve pairs or more.
     - `report.html` and, last, `metrics.json`.
     """
 
-    kind, config, folders, pictures = "comparison", "evaluation.yaml", ("pairs", "images"), "images"
+    kind, config, pictures = "comparison", "evaluation.yaml", "images"
+    folders = ("pairs", "images", "intervals")
     others = ("table.csv", "report.html")
 
     def claim(self, config: Any) -> None:
@@ -145,6 +148,9 @@ def run_evaluation(
     reasons = {task.file: reason for task, reason in failures.items()}
     findings = {f"{r['method']}, {r['name']}": r["findings"] for r in rows if r["findings"]}
     found = Evaluated(summarised(rows, counts), reasons, findings)
+    for method in (one.method for one in found.scores if one.covered):
+        samples = PixelSample.of_rows(row for row in rows if row["method"] == method)
+        folder.write(f"intervals/{method}.json", Intervals.calibrated(samples).as_json())
     whole = page.whole_page(config, opened(text)[1], found, parts, beside)
     surroundings = environment(time.time() - began)
     folder.write("report.html", render_report(whole, config, folder.path, surroundings, "images"))
