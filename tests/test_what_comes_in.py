@@ -143,16 +143,24 @@ def test_pixels_without_a_value(tmp_path, image_of, camera, hole):
         assert name != "psf" or said["unknown"]["number"] == np.isnan(holed["psf"]).sum()
 
 
+DEAD = {
+    "column": np.s_[:, 61],
+    "columns": np.s_[:, 61:63],
+    "row": np.s_[47],
+    "block": np.s_[47:51, 60:64],
+}
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("value", [0, FULL])
-@pytest.mark.parametrize("lines", [np.s_[:, 61], np.s_[:, 61:63], np.s_[47]], ids=str)
+@pytest.mark.parametrize("part", ["column", "columns", "row", "block"])
 @pytest.mark.parametrize("camera", [spots, diffuser])
-def test_dead_lines(image_of, camera, lines, value):
-    """In PSF and capture, that nobody told: 6 to 16 dB."""
+def test_dead_lines_and_blocks(image_of, camera, part, value):
+    """In PSF and capture, that nobody told: 5 to 16 dB."""
     given = pair(camera(SHAPE))
     best = quality(image_of(**given)[0], TRUE)
     for one in given.values():
-        one[lines] = value
+        one[DEAD[part]] = value
     image, said = image_of(**given)
     assert quality(image, TRUE) > best - WITHIN and {"replaced", "defective"} <= set(said)
 

@@ -274,6 +274,31 @@ def test_lines_of_one_value():
     assert stuck(light)[41].all()
 
 
+@pytest.mark.parametrize("level", [DARK, 0])
+@pytest.mark.parametrize("value", [0, 4095])
+@pytest.mark.parametrize("camera", ["spots", "sharp spots", "coarse cells", "diffuser", "zones"])
+def test_blocks_of_one_value(camera, value, level):
+    """4×4 pixels that nobody told, in captures above any black level."""
+    light = seen(scene(), CAMERAS[camera](SHAPE, 1))
+    image = np.maximum(counts(light, 1).astype(int) - DARK + level, 0).astype(np.uint16)
+    assert not defective_pixels(Raw(image, 12)).any()
+    image[30:34, 40:44], expected = value, np.zeros(SHAPE, bool)
+    expected[30:34, 40:44] = True
+    np.testing.assert_array_equal(defective_pixels(Raw(image, 12)), expected)
+
+
+@pytest.mark.parametrize("camera", ["spots", "sharp spots", "diffuser"])
+def test_a_bright_block_in_a_psf(camera):
+    """It is filled: within 0.3 dB, from up to 12. Spots that saturate are none."""
+    true, light = scene(), CAMERAS[camera](SHAPE, 1)
+    psf, capture = counts(light, 1), Raw(counts(seen(true, light), 2), 12)
+    clean = quality(image_of(Raw(psf, 12), capture)[0], true)
+    psf[45:49, 60:64] = 4095
+    assert quality(image_of(Raw(psf, 12), capture)[0], true) > clean - 0.3
+    for full in (4000, 6000, 10_000, 40_000):
+        assert not stuck(counts(light, 1, full).astype(float), 1.0).any()
+
+
 def test_exposure_and_border():
     light = seen(scene(), zones())
     dim = Raw(counts(light, full=40), 12)

@@ -15,6 +15,9 @@ _OUTER = np.flatnonzero(np.pad(np.zeros((3, 3)), 1, constant_values=1))  # of 5Ã
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 _SWEEPS = 30  # of a relaxation, from means of blocks
 _MOST, _WIDE = 0.1, 4  # share of pixels at one value, and width of lines, that are stuck
+_APART = 4.0  # times the range of the `_FEW` next values, by which a lowest value is apart
+_BLOCKS, _LARGE = 4, 9  # blocks at one value, and pixels of one that is no shadow
+_SQUARE = np.ones((3, 3), bool)
 
 
 def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
@@ -64,19 +67,21 @@ def defects(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarr
 
 
 def stuck(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray, "y x"]:
-    """Map of pixels at a lowest value that none comes near, and of lines of one value.
+    """Map of pixels at a lowest value that none comes near, and of lines and blocks of one value.
 
     A sensor's black level lies above 0 by more than its noise: blocks and padding at 0 do not. Up
     to `_WIDE` lines that are the lowest or highest value throughout, beside others that are not.
+    Up to `_BLOCKS` blocks of the lowest or highest value, without the blur of light around them.
 
     - `step`: step between values, 1 for counts.
     """
     low, high = plane.min(), plane.max()
     found, others = np.zeros(plane.shape, bool), plane[plane > low]
-    if min(plane.shape) < 8 or others.size == 0:
+    if min(plane.shape) < 8 or others.size <= _FEW:
         return found
-    floor = max(_CERTAIN * max(fine_noise(plane), step), 0.01 * float(high - low))
-    if 1 < plane.size - others.size < _MOST * plane.size and others.min() - low > floor:
+    darkest = np.partition(others, _FEW)[: _FEW + 1]
+    floor = max(_APART * float(np.ptp(darkest)), _CERTAIN * step, 0.01 * float(high - low))
+    if 1 < plane.size - others.size < _MOST * plane.size and darkest.min() - low > floor:
         found |= plane == low
     for lines, marked in ((plane, found), (plane.T, found.T)):
         for value in (low, high):
@@ -85,6 +90,56 @@ def stuck(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray
             for first, last in edges.reshape(-1, 2):
                 alone = max(share[first], share[last + 1]) < _MOST
                 marked[first:last] |= bool(alone) and last - first <= _WIDE
+    for value in (low, high):
+        same = (plane == value) & ~found
+        found |= _blocks(plane, same, step)
+    return found
+
+
+def _blocks(plane: np.ndarray, same: np.ndarray, step: float) -> np.ndarray:
+    """Blocks of at least 2Ã—2 pixels at the `same` extreme value, with steps at all their edges.
+
+    - sharp: twice those between neighbours elsewhere, but for one pixel in a thousand.
+    - whole: rectangles at a value that no other pixel comes near.
+    - deep: dark amid light that is even; noise would lift some pixels of a shadow.
+    """
+    nothing, seeds = np.zeros_like(same), np.zeros_like(same)
+    seeds[1:, 1:] = same[1:, 1:] & same[1:, :-1] & same[:-1, 1:] & same[:-1, :-1]
+    if not seeds.any():
+        return nothing
+    labels, count = scipy.ndimage.label(same, _SQUARE)
+    numbers = np.unique(labels[seeds])
+    around = scipy.ndimage.binary_dilation(np.isin(labels, numbers), _SQUARE)
+    value, spread = float(plane[same][0]), float(np.ptp(plane))
+    steps = [np.diff(np.where(around, np.nan, plane), axis=axis).ravel() for axis in (0, 1)]
+    steps = np.concatenate(steps)
+    steps = np.append(np.abs(steps[np.isfinite(steps)]), 0.0)
+    usual = float(np.quantile(steps, 0.999))
+    gap = float(np.abs(plane[~same] - value).min())
+    few = numbers.size <= _BLOCKS and same.sum() < _MOST * plane.size
+    least = max(_CERTAIN * step, 0.02 * spread)
+    is_alone = few and count == numbers.size and gap > least
+    is_noisy = fine_noise(plane) > 0 and value == plane.min()
+    kinds: dict[str, list[int]] = {"sharp": [], "whole": [], "deep": []}
+    places, sizes = scipy.ndimage.find_objects(labels), np.bincount(labels.ravel())
+    for number in numbers:
+        rows, columns = places[number - 1]
+        is_rectangle = sizes[number] == (rows.stop - rows.start) * (columns.stop - columns.start)
+        is_large = is_rectangle and is_noisy and sizes[number] >= _LARGE
+        if not (few or is_large):
+            continue
+        part = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in (rows, columns))
+        one = labels[part] == number
+        edge = np.abs(plane[part][scipy.ndimage.binary_dilation(one, _SQUARE) & ~one] - value)
+        step = edge.min()
+        kinds["sharp"] += [number] * bool(few and step > max(2 * usual, least))
+        kinds["whole"] += [number] * bool(is_alone and is_rectangle and step > spread / 8)
+        kinds["deep"] += [number] * bool(is_large and step > max(least, np.median(edge) / 2))
+    light, found = np.abs(plane - float(np.median(plane))), nothing
+    for kind, most in (("sharp", 0.3), ("whole", 0.6), ("deep", 0.3)):
+        some = np.isin(labels, kinds[kind])
+        if len(kinds[kind]) <= _BLOCKS and light[some].sum() < most * light.sum():
+            found = found | some
     return found
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.defects import defects, plateau
+from thincam_jax.imaging.defects import defects, plateau, stuck
 from thincam_jax.imaging.operators import AbstractOperator, Separable
 
 
@@ -48,7 +48,7 @@ def valid_pixels(
     _exclude(masks, good, "masked or NaN")
     if is_examined and not checks.holds_traced(captures):
         images = [np.asarray(capture) for capture in captures]
-        odd = [_each(image.astype(np.float32), defects) for image in images]
+        odd = [_each(image.astype(np.float32), lambda p: defects(p) | stuck(p)) for image in images]
         alike = [[other for other in odd if other.shape == one.shape] for one in odd]
         odd = [one & (2 * np.sum(s, axis=0) > len(s)) for one, s in zip(odd, alike, strict=True)]
         _exclude(masks, [~one for one in odd], "hot or dead")
