@@ -165,6 +165,23 @@ def test_dead_lines_and_blocks(image_of, camera, part, value):
     assert quality(image, TRUE) > best - WITHIN and {"replaced", "defective"} <= set(said)
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("level", [0, DARK])
+@pytest.mark.parametrize("camera", [spots, diffuser, zones, lambda s: cells(s, size=3)])
+def test_an_inverted_capture(image_of, camera, level):
+    """Its image is a negative: said, and the capture inverted again is as good as the right one."""
+    taken = np.uint16(DARK - level)
+    given = {name: np.maximum(one, taken) - taken for name, one in pair(camera(SHAPE)).items()}
+    best = quality(image_of(**given)[0], TRUE)
+    inverse = given["capture"].max() - given["capture"]
+    image, said = image_of(capture=inverse, psf=given["psf"])
+    assert quality(image, TRUE) < best - 10
+    assert said["misfit"]["advice"].endswith("give full scale minus captures, as 255 - captures")
+    assert said["misfit"]["severe"] and said["misfit"]["where"].endswith("capture.tif")
+    mended = image_of(capture=FULL - inverse, psf=given["psf"])[0]
+    assert quality(mended, TRUE) > best - WITHIN
+
+
 NUMBERS = {
     "whole": 26,
     "float": 26.0,

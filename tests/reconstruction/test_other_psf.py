@@ -10,7 +10,7 @@ import scipy.signal
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.reconstruction.other_psf import _FIT, RESIZE, TURN, _mirror, without_size
+from thincam_jax.reconstruction.other_psf import _FIT, NEGATIVE, RESIZE, TURN, _mirror, without_size
 
 RNG = np.random.default_rng(5)
 SHAPE = (52, 61)
@@ -50,6 +50,23 @@ def test_what_is_said_mends_the_image(turn):
     assert right.reason == ""
     errors = [relative_l2(np.asarray(found.image), SCENE) for found in (right, wrong)]
     assert errors[0] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("background", [None, 0.0])
+@pytest.mark.parametrize("noise", [0.002, 0.006])
+def test_inverted_captures_are_named_and_the_advice_mends_the_image(noise, background):
+    normal = np.random.default_rng(6).standard_normal(SHAPE)
+    capture = CLEAN + noise * CLEAN.max() * normal
+    known = {} if background is None else {"background": background}
+    full = 1.2 * CLEAN.max()
+    wrong = tc.Recording([full - capture], tc.Psfs(PSF[None]), **known)
+    negative = tc.reconstruct(wrong, SOLVER)
+    assert negative.reason == NEGATIVE and "give full scale minus captures" in NEGATIVE
+    found = tc.reconstruct(tc.Recording([full - wrong.captures[0]], tc.Psfs(PSF[None])), SOLVER)
+    right = tc.reconstruct(tc.Recording([capture], tc.Psfs(PSF[None])), SOLVER)
+    assert found.reason == right.reason == ""
+    errors = [relative_l2(one.image, SCENE) for one in (right, found, negative)]
+    assert errors[1] < 1.2 * errors[0] < 0.5 * errors[2]
 
 
 def test_a_psf_of_another_size_is_found():

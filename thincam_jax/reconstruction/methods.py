@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import functools
+import math
 import sys
 import time
 from typing import ClassVar
@@ -25,7 +26,7 @@ from thincam_jax.reconstruction.cut_psf import with_cut_psfs
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
-from thincam_jax.reconstruction.other_psf import better_psf
+from thincam_jax.reconstruction.other_psf import NEGATIVE, better_psf, inverted
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -72,6 +73,9 @@ _FIRST_PART = 0.4
 _FINE = 1e-4
 # Iterations after which an image that has not converged tells of misfit as well.
 _SETTLED = 100
+# Iterations from which on a negative image is told, and the residual over the noise that inverted
+# captures leave at most: 1.0 to 1.3, those of a wrong PSF 1.5 and more.
+_TELLING, _EXPLAINED = 40, 1.4
 
 
 @checked
@@ -323,6 +327,8 @@ class AdmmTV(AbstractRegularised):
         if given:
             return self._by_admm(problem, image, callback)
         outcome = self._by_levels(problem, image, callback)
+        if outcome.reason:
+            return outcome
         misfit = misfit_of(problem, outcome.image) if _is_settled(outcome) else None
         if misfit is None:
             return outcome
@@ -357,7 +363,9 @@ class AdmmTV(AbstractRegularised):
         """Outcome by way of larger pixels, if there are enough."""
         coarse, small, size = coarsened(with_cut_psfs(problem, image), image, _COARSER)
         if size == 1:
-            return self._from_nothing(problem, image, callback)
+            outcome = self._from_nothing(problem, image, callback)
+            said = self._negative(problem, problem, image, outcome)
+            return dataclasses.replace(outcome, reason=said)
         first = self._rough._from_nothing(coarse, small, None, rough=True)
         image = finer(first.image, problem.field_shape)
         if first.status in ("interrupted", "non_finite"):
@@ -370,7 +378,28 @@ class AdmmTV(AbstractRegularised):
         if second.status == "iterations_exhausted" and second.iterations < self.iterations:
             third = self._by_admm(problem, second.image, callback, second.iterations)
             second = _joined(second, third)
-        return dataclasses.replace(second, seconds=first.seconds + second.seconds)
+        is_over = second.status in ("stopped", "interrupted", "non_finite")
+        said = "" if is_over else self._negative(problem, coarse, small, first)
+        return dataclasses.replace(second, seconds=first.seconds + second.seconds, reason=said)
+
+    def _negative(self, problem: InverseProblem, coarse, image: Image, outcome: Outcome) -> str:
+        """A sentence where inverted captures fit far better, and to the noise, else nothing.
+
+        - `coarse`: the problem on larger pixels, with its start image and outcome.
+        """
+        is_sure = outcome.status in ("converged", "iterations_exhausted")
+        if not is_sure or outcome.iterations < _TELLING:
+            return ""
+        if (other := inverted(coarse, problem)) is None:
+            return ""
+        found = self._rough._from_nothing(other[0], image, None, rough=True)
+        lowest = found.history[-1].objective if found.history else math.inf
+        if lowest > other[1] * outcome.history[-1].objective:
+            return ""
+        whole, _ = inverted(problem, problem) or other
+        start = finer(found.image, problem.field_shape)
+        misfit = misfit_of(whole, self._by_admm(whole, start, None).image)
+        return NEGATIVE if misfit is not None and misfit.whole < _EXPLAINED else ""
 
     def _from_nothing(self, problem, image, callback, *, rough: bool = False) -> Outcome:
         """Outcome from a uniform or black image; a biased camera's begins without uniform light.

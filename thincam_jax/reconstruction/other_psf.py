@@ -1,15 +1,17 @@
-"""Whether captures fit PSFs better that are mirrored or of another size.
+"""Whether captures fit PSFs better that are mirrored or of another size, or are negatives.
 
 A wrong PSF explains a capture nearly as well as the right one, by an image full of artefacts; the
 objective, which counts these too, is 1.2 to 10 times that of the right one. It is compared on
-pixels four times as large.
+pixels four times as large. So is that of the inverted captures.
 """
 
 from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex
+from numpy.lib.stride_tricks import sliding_window_view
 
 from thincam_jax.reconstruction.coarse import coarsened
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions
@@ -20,10 +22,13 @@ TURN = "turn the PSF or the captures"
 RESIZE = "refine it (thincam calibrate check --refine), or the cameras' distance"
 _FIT = "the captures fit far better a PSF that"
 MIRRORED = {"upside down": (-2,), "mirrored left to right": (-1,), "turned by 180°": (-2, -1)}
+NEGATIVE = "the captures fit far better inverted; give full scale minus captures, as 255 - captures"
 _SCALES = (0.94, 0.97, 1.03, 1.06)
 _COARSER = 2  # times twice as large
 _BETTER = 0.85  # of the objective
+_FAR_BETTER = 0.5  # of the objective, where noise that falls does not tell of inversion
 _LARGEST = 256  # pixels of the shorter side that are solved for this
+_GROWS, _FALLS = 1.15, 0.85  # noise where it is bright over that where it is dark
 
 
 def better_psf(
@@ -58,6 +63,61 @@ def better_psf(
     best = min(found, key=lambda name: found[name])
     is_better = found[best] < _BETTER * solve(problem, image)
     return f"{_FIT} {best}" if is_better else ""
+
+
+def inverted(problem: InverseProblem, fine: InverseProblem) -> tuple[InverseProblem, float] | None:
+    """The problem of the inverted captures, and below what share of the objective it is right.
+
+    A negative of the image explains a negative to the noise, but its variation is larger. Where
+    the noise grows with the light, as that of photons does, captures are none: the result is None,
+    as it is for operators that are no convolutions, and for several planes.
+
+    - `fine`: the problem on all pixels, whose noise is looked at.
+    """
+    growth = _noise_growth(fine)
+    if growth > _GROWS or convolutions(problem) is None or problem.image_shape[-3] > 1:
+        return None
+    captures = []
+    for capture, weight in zip(problem.captures, problem.weights, strict=True):
+        known, axes = weight > 0, (-2, -1)
+        high = jnp.max(jnp.where(known, capture, -jnp.inf), axes, keepdims=True)
+        low = jnp.min(jnp.where(known, capture, jnp.inf), axes, keepdims=True)
+        captures.append(2 * high - low - capture)  # with a background that is not negative
+    if problem.has_background:
+        found = eqx.tree_at(lambda p: p.captures, problem, tuple(captures))
+    else:
+        found = InverseProblem(
+            problem.operators,
+            captures,
+            weights=problem.weights,
+            tau=problem.tau,
+            regulariser=problem.regulariser,
+            nonnegative=problem.nonnegative,
+            background="unknown",
+        )
+        found = eqx.tree_at(lambda p: p.tau_unit, found, problem.tau_unit)
+    return found, 1.0 if growth < _FALLS else _FAR_BETTER
+
+
+def _noise_growth(problem: InverseProblem) -> float:
+    """Median detail of the brightest quarter of the captures' pixels over that of the darkest."""
+    found = []
+    for capture, weight in zip(problem.captures, problem.weights, strict=True):
+        shape = -1, *capture.shape[-2:]
+        known = np.broadcast_to(np.asarray(weight) > 0, capture.shape).reshape(shape)
+        for plane, good in zip(np.asarray(capture).reshape(shape), known, strict=True):
+            inside = good & (plane > plane.min()) & (plane < plane.max())
+            detail, light = plane, plane
+            for axis in (0, 1):
+                detail = np.diff(detail, 2, axis)
+                light = sliding_window_view(light, 3, axis).mean(axis=-1)
+                inside = sliding_window_view(inside, 3, axis).all(axis=-1)
+            detail = np.abs(detail[inside])[np.argsort(light[inside])]
+            quarter = detail.size // 4
+            if quarter:
+                dark, bright = np.median(detail[:quarter]), np.median(detail[-quarter:])
+                found.append(float(bright / dark) if dark > 0 else np.inf)
+    return float(np.median(found)) if found else np.inf
 
 
 def without_size(reason: str) -> str:

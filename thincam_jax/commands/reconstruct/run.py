@@ -32,7 +32,7 @@ from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.reconstruction.depth.find import depth_of_colours
 from thincam_jax.reconstruction.iterate import Progress
 from thincam_jax.reconstruction.methods import AbstractRegularised, choose_solver
-from thincam_jax.reconstruction.other_psf import RESIZE, TURN
+from thincam_jax.reconstruction.other_psf import NEGATIVE, RESIZE, TURN
 from thincam_jax.reconstruction.psf_check import blocks_blur, check_psf
 from thincam_jax.reconstruction.refinement import changed_psf, refine
 from thincam_jax.studies.prepared import (
@@ -252,7 +252,9 @@ def _doubts(job: Job, ready: Prepared, done: PreparedResult) -> Iterator[Finding
     """A residual far above the noise, and a given noise that is not the one found."""
     where, (left, least) = f"capture {job.capture}", _left(ready, done)
     if why := done.found.reason:
-        yield finding("misfit", where, 3 * left / least, why.endswith((TURN, RESIZE)), why)
+        yield finding(
+            "misfit", where, 3 * left / least, why.endswith((TURN, RESIZE, NEGATIVE)), why
+        )
     if left > max(_SUSPECT, least):
         yield finding("unexplained", where, 100 * left, True)
     given, found = done.noise.counts, pixel_noise(ready).counts
