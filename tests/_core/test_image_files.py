@@ -151,6 +151,23 @@ def test_whole_lossy_files_are_read(tmp_path):
     assert np.abs(read_image(path).pixels.astype(float) - smooth).max() < 40
 
 
+def test_a_jpeg_is_decoded_twice(tmp_path, monkeypatch):
+    """Once as it is, and once with more data, which tell whether it was whole."""
+    (tmp_path / "a.jpg").write_bytes(saved(COLOUR, "JPEG"))
+    decoder, made = PIL.Image._getdecoder, []
+
+    def counted(mode, *rest):
+        made.append(mode)
+        return decoder(mode, *rest)
+
+    monkeypatch.setattr(PIL.Image, "_getdecoder", counted)
+    with pytest.warns(NonlinearWarning):
+        read_image(tmp_path / "a.jpg")
+    assert made == ["RGB"] * 2
+    tc.load_image(tmp_path / "a.jpg")
+    assert made == ["RGB"] * 4
+
+
 def test_packed_images_have_a_largest_size(tmp_path, monkeypatch):
     monkeypatch.setattr(image_files, "_MOST_PIXELS", GREY.size - 1)
     flat = np.zeros(SHAPE, np.uint8)

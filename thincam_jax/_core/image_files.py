@@ -168,14 +168,23 @@ def _jpeg_size(file: Any) -> tuple[int, int]:
 
 
 def _check_jpeg(data: bytes) -> None:
-    """Require as many coded blocks as the image has: data after them make no difference to it."""
+    """Limit the scans, each of which is decoded; `opened` finds those cut short."""
     if (count := data.count(_JPEG_SCAN)) > _MOST_SCANS:
         raise ImageFileError(f"has {count} scans, at most {_MOST_SCANS} are read; save it anew")
-    begin, _, end = data.rpartition(_JPEG_END)
-    more = begin + b"\x55\x3a" * 32 + _JPEG_END + end
-    first, second = (PIL.Image.open(io.BytesIO(one)).tobytes() for one in (data, more))
-    if first != second:
-        raise ValueError("its data end before its image")
+
+
+def opened(data: bytes) -> PIL.Image.Image:
+    """Image by Pillow; a JPEG is decoded, and has as many coded blocks as its image.
+
+    Data after all of them make no difference to it. **Errors**: ValueError if they do.
+    """
+    image = PIL.Image.open(io.BytesIO(data))
+    if kind_of_start(data[:8]) == "jpeg":
+        begin, _, end = data.rpartition(_JPEG_END)
+        more = begin + b"\x55\x3a" * 32 + _JPEG_END + end
+        if image.tobytes() != PIL.Image.open(io.BytesIO(more)).tobytes():
+            raise ValueError("its data end before its image")
+    return image
 
 
 def tiff_pages(file: tifffile.TiffFile) -> list[tifffile.TiffPage]:

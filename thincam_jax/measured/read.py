@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import PIL.Image
 import tifffile
 from jaxtyping import Bool
 
@@ -25,6 +24,7 @@ from thincam_jax._core.image_files import (
     kind_of,
     kind_of_start,
     npy_header,
+    opened,
     png_header,
     rawpy,
     read_whole,
@@ -325,7 +325,7 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], _Facts]:
 
 def _by_pillow(data: bytes) -> tuple[np.ndarray, _Facts]:
     """Pixels as they are stored, their orientation and exposure."""
-    with PIL.Image.open(io.BytesIO(data)) as file:
+    with opened(data) as file:
         exif = file.getexif()
         time = exif.get_ifd(_EXIF).get(_EXPOSURE_TIME)
         return np.array(file), {"orientation": exif.get(ORIENTATION, 1), **_exposure(time)}

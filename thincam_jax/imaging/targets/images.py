@@ -9,14 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import PIL.Image
 import skimage
 import tifffile
 from jaxtyping import ArrayLike, Float64, Num
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.image_files import ImageFileError, kind_of, png_header, rawpy, read_whole
+from thincam_jax._core.image_files import (
+    ImageFileError,
+    kind_of,
+    opened,
+    png_header,
+    rawpy,
+    read_whole,
+)
 from thincam_jax.imaging.encoding import ORIENTATION, decoded, upright
 
 _DNG_VERSION = 50706  # tag
@@ -117,7 +123,7 @@ def _read_raw(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
 
 
 def _read_other(data: bytes) -> tuple[np.ndarray, dict[Any, Any], int]:
-    with PIL.Image.open(io.BytesIO(data)) as file:
+    with opened(data) as file:
         tags: dict[Any, Any] = file.info
         orientation = file.getexif().get(ORIENTATION, 1)
         if file.mode in ("CMYK", "P") and file.format in ("JPEG", "TIFF"):
