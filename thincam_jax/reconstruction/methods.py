@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import functools
-import math
 import sys
 import time
 from typing import ClassVar
@@ -26,7 +25,7 @@ from thincam_jax.reconstruction.cut_psf import with_cut_psfs
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
-from thincam_jax.reconstruction.other_psf import NEGATIVE, better_psf, inverted
+from thincam_jax.reconstruction.other_psf import better_psf, negative_captures
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -73,9 +72,6 @@ _FIRST_PART = 0.4
 _FINE = 1e-4
 # Iterations after which an image that has not converged tells of misfit as well.
 _SETTLED = 100
-# Iterations from which on a negative image is told, and the residual over the noise that inverted
-# captures leave at most: 1.0 to 1.3, those of a wrong PSF 1.5 and more.
-_TELLING, _EXPLAINED = 40, 1.4
 
 
 @checked
@@ -383,23 +379,10 @@ class AdmmTV(AbstractRegularised):
         return dataclasses.replace(second, seconds=first.seconds + second.seconds, reason=said)
 
     def _negative(self, problem: InverseProblem, coarse, image: Image, outcome: Outcome) -> str:
-        """A sentence where inverted captures fit far better, and to the noise, else nothing.
-
-        - `coarse`: the problem on larger pixels, with its start image and outcome.
-        """
-        is_sure = outcome.status in ("converged", "iterations_exhausted")
-        if not is_sure or outcome.iterations < _TELLING:
-            return ""
-        if (other := inverted(coarse, problem)) is None:
-            return ""
-        found = self._rough._from_nothing(other[0], image, None, rough=True)
-        lowest = found.history[-1].objective if found.history else math.inf
-        if lowest > other[1] * outcome.history[-1].objective:
-            return ""
-        whole, _ = inverted(problem, problem) or other
-        start = finer(found.image, problem.field_shape)
-        misfit = misfit_of(whole, self._by_admm(whole, start, None).image)
-        return NEGATIVE if misfit is not None and misfit.whole < _EXPLAINED else ""
+        """A sentence where inverted captures fit far better; see `negative_captures`."""
+        start = functools.partial(self._rough._from_nothing, callback=None, rough=True)
+        finish = functools.partial(self._by_admm, callback=None)
+        return negative_captures(problem, coarse, image, outcome, start, finish)
 
     def _from_nothing(self, problem, image, callback, *, rough: bool = False) -> Outcome:
         """Outcome from a uniform or black image; a biased camera's begins without uniform light.

@@ -5,6 +5,7 @@ objective, which counts these too, is 1.2 to 10 times that of the right one. It 
 pixels four times as large. So is that of the inverted captures.
 """
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -13,10 +14,12 @@ import numpy as np
 from jaxtyping import Complex
 from numpy.lib.stride_tricks import sliding_window_view
 
-from thincam_jax.reconstruction.coarse import coarsened
+from thincam_jax.reconstruction.coarse import coarsened, finer
+from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions
 from thincam_jax.reconstruction.psf_check import scaled_psf
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.smooth_misfit import misfit_of
 
 TURN = "turn the PSF or the captures"
 RESIZE = "refine it (thincam calibrate check --refine), or the cameras' distance"
@@ -28,6 +31,9 @@ _COARSER = 2  # times twice as large
 _BETTER = 0.85  # of the objective
 _FAR_BETTER = 0.5  # of the objective, where noise that falls does not tell of inversion
 _LARGEST = 256  # pixels of the shorter side that are solved for this
+# Iterations that tell of an objective, and the residual over the noise that inverted captures leave
+# at most: 1.0 to 1.3, those of a wrong PSF 1.5 and more.
+_ENOUGH, _EXPLAINED = 40, 1.4
 _GROWS, _FALLS = 1.15, 0.85  # noise where it is bright over that where it is dark
 
 
@@ -63,6 +69,32 @@ def better_psf(
     best = min(found, key=lambda name: found[name])
     is_better = found[best] < _BETTER * solve(problem, image)
     return f"{_FIT} {best}" if is_better else ""
+
+
+def negative_captures(
+    problem: InverseProblem,
+    coarse: InverseProblem,
+    image: Image,
+    outcome: Outcome,
+    start: Callable[[InverseProblem, Image], Outcome],
+    finish: Callable[[InverseProblem, Image], Outcome],
+) -> str:
+    """A sentence where inverted captures fit far better, and to the noise, else nothing.
+
+    - `coarse`: the problem on larger pixels, with its start `image` and `outcome`.
+    - `start`: solver of such a problem. `finish`: solver on all pixels, from an image.
+    """
+    is_sure = outcome.status in ("converged", "iterations_exhausted")
+    if not is_sure or outcome.iterations < _ENOUGH or (other := inverted(coarse, problem)) is None:
+        return ""
+    found = start(other[0], image)
+    lowest = found.history[-1].objective if found.history else math.inf
+    if lowest > other[1] * outcome.history[-1].objective:
+        return ""
+    whole, _ = inverted(problem, problem) or other
+    found = finish(whole, finer(found.image, problem.field_shape))
+    misfit = misfit_of(whole, found.image)
+    return NEGATIVE if misfit is not None and misfit.whole < _EXPLAINED else ""
 
 
 def inverted(problem: InverseProblem, fine: InverseProblem) -> tuple[InverseProblem, float] | None:
