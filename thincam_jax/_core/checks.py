@@ -231,11 +231,11 @@ def _require_numbers(name: str, value: Any, dtype: np.dtype, allow_complex: bool
         raise TypeError(f"{name} is {shown(value)}; give an array of {kind}")
 
 
-def points(name: str, value: Any, words: str = "points (y, x) in mm") -> Array:
-    """Pairs as the last axis of an array; `words` say what to give."""
+def points(name: str, value: Any) -> Array:
+    """Pairs as the last axis of an array."""
     array = finite(name, value, "mm", shape=shape_of(value))
     if array.shape[-1:] != (2,) or 0 in array.shape:
-        raise ValueError(f"{name} has shape {array.shape}; give {words}, (…, 2)")
+        raise ValueError(f"{name} has shape {array.shape}; give points (y, x) in mm, (…, 2)")
     return array
 
 

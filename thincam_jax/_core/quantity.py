@@ -139,11 +139,11 @@ def whole(
     return Quantity("", check, optional=optional, least=least, most=most, many=many)
 
 
-def choice(options: Iterable[str], *, optional: bool = False, many: bool = False) -> Quantity:
+def choice(options: Iterable[str], *, many: bool = False) -> Quantity:
     """One of several words."""
     options = tuple(options)
     check = functools.partial(checks.choice, options=options)
-    return Quantity("", check, optional=optional, choices=options, many=many)
+    return Quantity("", check, choices=options, many=many)
 
 
 def unchecked(unit: str = "", parts: Mapping[str, Quantity] | None = None) -> Quantity:

@@ -238,7 +238,7 @@ def counted(name: str) -> Iterator[Callable[[str, int], None]]:
 
 
 @contextlib.contextmanager
-def lines_in_a_log(bar: "rich.progress.Progress", every: float = 10.0) -> Iterator[None]:
+def lines_in_a_log(bar: "rich.progress.Progress") -> Iterator[None]:
     """A line every ten seconds on standard error where a bar cannot move, as in a file."""
 
     def say_all() -> float:
@@ -247,8 +247,8 @@ def lines_in_a_log(bar: "rich.progress.Progress", every: float = 10.0) -> Iterat
                 f"{task.description} ({task.completed:g} of {task.total or 0:g}), "
                 f"{task.elapsed or 0:.0f} s"
             )
-        return every
+        return 10.0
 
     is_still = not bar.disable and not bar.console.is_terminal
-    with repeating(say_all, every) if is_still else contextlib.nullcontext():
+    with repeating(say_all, 10.0) if is_still else contextlib.nullcontext():
         yield

@@ -182,12 +182,10 @@ def _decibel(level: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.where(level > 10 ** (_FLOOR_DB / 10), level, np.nan))
 
 
-def draw_fronts(
-    scores: "FrontsScores", reference: str, object_distance: float, figure: Figure | None = None
-) -> Figure:
+def draw_fronts(scores: "FrontsScores", reference: str, object_distance: float) -> Figure:
     """A panel for each front; `object_distance` in mm, `reference`: name of the design to beat."""
     count = len(scores.fronts)
-    drawn, panels = drawing((4.2 * count + 0.6, 4.9), 1, count, figure=figure, squeeze=False)
+    drawn, panels = drawing((4.2 * count + 0.6, 4.9), 1, count, squeeze=False)
     drawn.set_layout_engine(ConstrainedLayoutEngine(wspace=0.06))
     for ax, (name, front) in zip(panels[0], scores.fronts.items(), strict=True):
         ax.set_xlabel(_LABELS[name])

@@ -165,23 +165,6 @@ def test_faults_are_told_in_one_line_with_their_place(override, part, tmp_path):
     assert part in line
 
 
-@pytest.mark.parametrize(
-    ("override", "part"),
-    [
-        ("hologram.reference_angle=40 deg", "under the critical angle of 41.81°"),
-        ("screen.glass_index=1.3", "a glass of n = 1.3 cannot carry"),
-        (
-            "screen.bottom.height=12 mm",
-            r"smaller than one bounce of the guided light, \(18.19, 0\)",
-        ),
-    ],
-)
-def test_a_plate_that_guides_no_light_is_refused(override, part, tmp_path):
-    config = tiny.experiment(tmp_path, override)
-    with pytest.raises(ConfigError, match=rf"tiny.yaml:\d+: screen: .*{part}"):
-        build_screen(config)
-
-
 def test_the_shipped_file(tmp_path):
     shipped = tiny.experiment(tmp_path, text=(ROOT / "configs/sts_camera.yaml").read_text("utf-8"))
     assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
