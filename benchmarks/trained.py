@@ -4,9 +4,15 @@
 captures of the photographs behind the camera of a PSF, each with its own faults, which no method
 knows; gain and offset of every image are fitted. Prints a table, and draws worst, median and best
 image by the gain of the network, and a real capture, into DIR.
+
+`python benchmarks/trained.py FOLDER PSF PHOTOGRAPHS --without-each --downsample 24 --count 60`:
+small networks learn from the photographs of FOLDER, with all faults and without each in turn.
+
+`python benchmarks/trained.py --scores DIR`: the worst, median and best image of `thincam evaluate`.
 """
 
 import argparse
+import json
 import logging
 import time
 from dataclasses import replace
@@ -18,8 +24,10 @@ import numpy as np
 import thincam_jax as tc
 from thincam_jax import measured
 from thincam_jax.learn.denoiser.pictures import united
-from thincam_jax.learn.trained import TrainedReconstruction
-from thincam_jax.learn.trained_lessons import CameraLessons, photographs
+from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction, cleaned
+from thincam_jax.learn.trained_lessons import CameraLessons, drawn, photographs
+from thincam_jax.learn.trained_training import ReconstructionLessons, train_reconstruction
+from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.studies.agreement import agreement
 from thincam_jax.studies.prepared import pixel_noise, prepared_recording
 
@@ -39,6 +47,21 @@ def draw(rows, path):
             ax.set(xticks=[], yticks=[])
     figure.tight_layout()
     figure.savefig(path, dpi=110)
+
+
+def draw_scores(folder, path):
+    """Capture, truth and images of the worst, median and best pair of an evaluation."""
+    methods = [one["method"] for one in json.loads((folder / "metrics.json").read_text())["scores"]]
+    columns = ["truth", "capture", *(one.replace("_", "-") for one in methods)]
+    figure, axes = plt.subplots(3, len(columns), figsize=(2.1 * len(columns), 6.4))
+    for row, word in zip(axes, ("worst", "median", "best"), strict=True):
+        for ax, column in zip(row, columns, strict=True):
+            ax.imshow(plt.imread(folder / "images" / f"{word}-{column}.png"), cmap="gray")
+            ax.set(xticks=[], yticks=[])
+            ax.set_title(column if word == "worst" else "", fontsize=9)
+        row[0].set_ylabel(word)
+    figure.tight_layout()
+    figure.savefig(path, dpi=75)
 
 
 def compare(camera, methods, count):
@@ -63,17 +86,64 @@ def compare(camera, methods, count):
     return scores, shown
 
 
+FAULTS = ("scale", "turn", "blur", "background", "ambient", "saturated", "hot", "bits")
+
+
+def without_each(judge, learned, count):
+    """Gains over its physics step of a network that has seen all faults but one."""
+    sizes = TrainedOptions(40, (16, 24, 32))
+    options = TrainingOptions(400, 1e-3, check_every=50, averaging=0.98)
+    faults = {"": learned.faults, **{one: learned.faults.without(one) for one in FAULTS}}
+    faults["PSF's"] = replace(learned.faults, scale=0.0, turn=0.0, blur=0.0)
+    gains = {}
+    for name, some in faults.items():
+        camera = replace(learned, faults=some)
+        lessons = ReconstructionLessons(camera, pool=120, judged=8, batch=8, crop=32)
+        untrained = TrainedReconstruction.create(sizes, camera.psf, key=0)
+        model = train_reconstruction(untrained, lessons, options).model
+        drawn_ = judge.examples(model.physics, SEED, count)
+        pairs = zip(drawn_.images, np.asarray(drawn_.truth, np.float32), strict=True)
+        values = []
+        for images, truth in pairs:
+            images = images.astype(np.float32)
+            found = np.maximum(cleaned(model.network, 1, images), 0)
+            ends = (agreement(np.asarray(one), truth).psnr_db for one in (images[-1], found))
+            before, after = ends
+            values.append(after - before)
+        gains[name] = np.asarray(values)
+        lost = gains[name] - gains[""]
+        half = 2.0 * lost.std(ddof=1) / count**0.5
+        print(f"| {name or 'none'} | {gains[name].mean():+.2f} | {lost.mean():+.3f} ± {half:.3f} |")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("network", "psf", "photographs"):
-        parser.add_argument(name, type=Path)
+        parser.add_argument(name, type=Path, nargs="?")
+    parser.add_argument("--scores", type=Path)
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--downsample", type=int, default=8)
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--out", type=Path, default=Path("runs/trained"))
+    parser.add_argument("--without-each", action="store_true")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
+    if given.scores:
+        draw_scores(given.scores, given.out / "trained-rig.png")
+        return
     logging.getLogger("thincam_jax").setLevel(logging.ERROR)
+    raw, capture = measured.read_image(given.psf), given.capture or given.psf
+    options = measured.Preparation(downsample=given.downsample)
+    ready = measured.prepare(
+        raw, measured.read_image(capture), background="corner", options=options
+    )
+    rows, columns = ready.capture.shape[-2:]
+    pictures = united(list(photographs(given.photographs).values()))
+    camera = CameraLessons(ready.psf, (rows, columns), pictures)
+    if given.without_each:
+        learned = united([*photographs(given.network).values(), drawn(0, 20)])
+        without_each(camera, replace(camera, pictures=learned), given.count)
+        return
     trained = TrainedReconstruction.load(given.network)
     methods = {
         "ridge": tc.Ridge(),
@@ -85,14 +155,6 @@ def main():
             trained, physics=replace(trained.physics, iterations=300)
         ),
     }
-    raw, capture = measured.read_image(given.psf), given.capture or given.psf
-    options = measured.Preparation(downsample=given.downsample)
-    ready = measured.prepare(
-        raw, measured.read_image(capture), background="corner", options=options
-    )
-    rows, columns = ready.capture.shape[-2:]
-    pictures = united(list(photographs(given.photographs).values()))
-    camera = CameraLessons(ready.psf, (rows, columns), pictures)
     scores, shown = compare(camera, methods, given.count)
     reference = np.asarray([one[0] for one in scores["AdmmTV"]])
     print("| method | PSNR, dB | gain over AdmmTV, dB | SSIM | CPU s |\n|---|---|---|---|---|")

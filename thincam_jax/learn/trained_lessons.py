@@ -188,6 +188,12 @@ class PairLessons:
     first: int
     most: int
 
+    @property
+    def manifest(self) -> tuple[Entry, ...]:
+        """Entries of the pairs, with the sum of capture and truth."""
+        pairs, numbers = self.pairs, range(self.first, self.first + self.most)
+        return tuple(Entry(pairs.names[n], pairs.digest(n), pairs.licence) for n in numbers)
+
     def examples(self, physics: PhysicsStep, seed: int, count: int) -> PreparedExamples:
         """Input and truth of the network; see `levelled`."""
         numbers = range(self.first, self.first + min(count, self.most))

@@ -18,6 +18,7 @@ from hardware.commands.test_alignment import ALIGNMENT, PICTURES
 
 from helpers import ROOT
 from thincam_jax.learn.commands.trained import TrainedConfig, build_lessons
+from thincam_jax.learn.trained import training_record
 from thincam_jax.learn.trained_lessons import PairLessons
 from thincam_jax.learn.trained_training import NETWORK, STATE
 from thincam_jax.measured.calibration.alignment import Alignment
@@ -106,6 +107,10 @@ def test_from_captures_to_a_network_that_is_scored_on_others(home):
     done = train(file, killed, "--resume")
     assert done.exit_code == 0, done.output
     assert (killed / NETWORK).read_bytes() == (out / NETWORK).read_bytes()
+    images = training_record(out / NETWORK)["images"]
+    assert [one["name"] for one in images["trained on"]] == known[:-2]
+    assert [one["name"] for one in images["judged on"]] == known[-2:]
+    assert {one["licence"] for one in images["trained on"]} == {"own (README.md)"}
 
     # From the camera alone, then on its pairs.
     del named["pairs"]

@@ -178,7 +178,9 @@ def build_lessons(config: TrainedConfig) -> ReconstructionLessons:
     images = {"trained on": train.manifest, "judged on": judge.manifest}
     parts: dict[str, Any] = {"judge": made[1]}
     if config.pairs is not None:
-        parts["train"], parts["judge"] = _pairs(config)
+        parts["train"], parts["judge"] = pairs = _pairs(config)
+        known = zip(("trained on", "judged on"), pairs, strict=True)
+        images = {"fitted on": images["trained on"], **{use: one.manifest for use, one in known}}
     lessons = {"camera": made[0], "images": images, **parts}
     try:
         return config.training.build(ReconstructionLessons, **lessons)
