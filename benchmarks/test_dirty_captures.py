@@ -245,6 +245,7 @@ def by_recording(number, caplog):
         convolution = CropConvolution(psfs, 1.0, SHAPE, (SIDE, SIDE), summed=1)
         operator = LowRank(np.stack([np.ones_like(y), 0.3 * y, 0.3 * x]), convolution)
     light = np.stack([np.asarray(operator(one)) for one in image])
+    light = np.maximum(light, 0)  # transforms round
     counts = dirt.counts(light).astype(float) / FULL
     truth, level = image.mean(axis=0), dirt.level / FULL
     valid = ~dirt.hot & (counts < 1)
