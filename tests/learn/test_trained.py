@@ -16,6 +16,7 @@ from thincam_jax.learn.trained import (
     CameraPortrait,
     TrainedOptions,
     TrainedReconstruction,
+    _like,
     cleaned,
     completed,
     prepared,
@@ -71,6 +72,24 @@ def test_untrained_it_gives_the_image_of_its_physics_step():
     assert found.image.shape == (1, 24, 32) and found.status == "ok" and found.method == "trained"
     np.testing.assert_allclose(found.image, inside, atol=1e-5)
     assert np.corrcoef(np.ravel(found.image), np.ravel(scene))[0, 1] > 0.8
+
+
+def test_plug_and_play_may_be_the_physics_step(tmp_path):
+    """Also of a file; one of a version before has none, and total variation."""
+    recording, _ = recorded()
+    options = dataclasses.replace(OPTIONS, method="pnp")
+    untrained = TrainedReconstruction.create(options, PSF, key=0)
+    found = tc.reconstruct(recording, untrained).image
+    like = tc.reconstruct(with_whole_field(recording), tc.PlugAndPlay()).image
+    y, x = ((n - m) // 2 for n, m in zip(like.shape[-2:], (24, 32), strict=True))
+    inside = np.maximum(like[..., y : y + 24, x : x + 32], 0)
+    np.testing.assert_allclose(found, inside, atol=1e-5)
+    read = TrainedReconstruction.load(untrained.save(tmp_path / "network.thincam"))
+    assert read.options == options
+    known = {"iterations": 6, "colours": 1, "widths": [4, 6], "noises": 1}
+    assert _like(known, {}).options == OPTIONS
+    with pytest.raises(ValueError, match="method"):
+        TrainedOptions(method="wiener")
 
 
 def test_the_second_image_gives_back_what_the_first_one_left():

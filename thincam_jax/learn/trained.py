@@ -3,14 +3,14 @@ r"""A reconstruction trained for one camera: a physics step, then a small U-Net.
 The physics step inverts the camera's model; the network removes what that leaves where the model is
 wrong and the capture noisy (Khan et al., FlatNet, IEEE Trans. Pattern Anal. 44, 1934, 2022;
 Monakhova et al., Opt. Express 27, 28075, 2019; Zeng and Lam, MWDN, IEEE Trans. Comput. Imaging 7,
-1156, 2021). It is some iterations of `AdmmTV`, which know of the crop, the background and the
-noise, and the Wiener filter of what their image f leaves of the capture g,
+1156, 2021). It is some iterations of `AdmmTV`, or `PlugAndPlay`, which know of the crop, the
+background and the noise, and the Wiener filter of what their image f leaves of the capture g,
 
 .. math:: f_W = f + F^{-1}\Big[\frac{\bar H}{|H|^2 + \lambda\,\overline{|H|^2}/S}\,
     F (g - A f - b)\Big]
 
-for a scene of the power spectrum S, ∝ 1/(1 + u²), which gives back the detail that total variation
-took for noise. Its relative noise λ is learned for each colour. The network sees both images and
+for a scene of the power spectrum S, ∝ 1/(1 + u²), which gives back the detail that they took for
+noise. Its relative noise λ is learned for each colour. The network sees both images and
 adds what is missing to f.
 """
 
@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_mean, central_blocks
 from thincam_jax._core.precision import AccuracyWarning, as_complex, squared_modulus
-from thincam_jax._core.quantity import FieldError, check_fields, whole
+from thincam_jax._core.quantity import FieldError, check_fields, choice, whole
 from thincam_jax._core.random import Key, random_key
 from thincam_jax._core.text import of_error
 from thincam_jax.imaging.operators import CropConvolution
@@ -43,6 +43,7 @@ from thincam_jax.learn.checkpoint import (
     read_weights,
     write_arrays,
 )
+from thincam_jax.learn.plug_and_play import PlugAndPlay
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.reconstruction.imaging_model import Psfs
 from thincam_jax.reconstruction.methods import AdmmTV
@@ -69,6 +70,7 @@ _WHITE = 99.5  # percentile of an image that is 1 for the network
 class TrainedOptions:
     """Size of the physics step and of the network.
 
+    - `method`: "admm_tv", or "pnp", `PlugAndPlay` as it is, which is six times as slow.
     - `iterations`: iterations of `AdmmTV`, at most; 40 are twice as fast and 0.8 dB worse.
     - `widths`: channels of the levels of the `UNet`, from the finest.
     - `colours`: colours that the network sees together: 1 or as many as the captures have.
@@ -79,6 +81,7 @@ class TrainedOptions:
     iterations: Annotated[int, whole(1, 1000)] = 100
     widths: Annotated[tuple[int, ...], whole(1, 512, many=True)] = (32, 48, 64, 96)
     colours: Annotated[int, whole(1, 16)] = 1
+    method: Annotated[str, choice(("admm_tv", "pnp"))] = "admm_tv"
 
     def __post_init__(self):
         check_fields(self)
@@ -87,19 +90,21 @@ class TrainedOptions:
 
 
 class PhysicsStep(eqx.Module):
-    """`AdmmTV` and the Wiener filter of what it leaves; see the module's equation.
+    """`AdmmTV` or `PlugAndPlay` and the Wiener filter of what it leaves; see the module's equation.
 
     - `noise`: ln λ of each colour, or one for all.
     """
 
     noise: Float[Array, " colour"]
     iterations: int = eqx.field(static=True)
+    method: str = eqx.field(static=True, default="admm_tv")
 
     def __call__(self, recording: Recording) -> tuple[InverseProblem, Image]:
         """The problem of the whole field that sends light to the sensor, and the image of it."""
         whole_field = with_whole_field(recording)
         problem = whole_field.problem()
-        found = AdmmTV(iterations=self.iterations).solve(pinned(whole_field))
+        solver = PlugAndPlay() if self.method == "pnp" else AdmmTV(iterations=self.iterations)
+        found = solver.solve(pinned(whole_field))
         return problem, jnp.asarray(found.image).reshape(problem.image_shape)
 
 
@@ -266,7 +271,8 @@ class TrainedReconstruction(AbstractSolver):
         colours = psf.shape[0] if psf.ndim > 2 else 1
         noise, together = jnp.full(colours, np.log(0.1), jnp.float32), options.colours
         network = UNet(_IMAGES * together, together, options.widths, key=random_key(key))
-        return cls(PhysicsStep(noise, options.iterations), network, CameraPortrait.of(psf))
+        physics = PhysicsStep(noise, options.iterations, options.method)
+        return cls(physics, network, CameraPortrait.of(psf))
 
     @property
     def options(self) -> TrainedOptions:
@@ -274,7 +280,7 @@ class TrainedReconstruction(AbstractSolver):
         network = self.network
         widths = tuple(one.first.weight.shape[0] for one in network.before)
         colours = network.leave.weight.shape[0] // 4
-        return TrainedOptions(self.physics.iterations, widths, colours)
+        return TrainedOptions(self.physics.iterations, widths, colours, self.physics.method)
 
     def solve(self, recording: Recording) -> Reconstruction:
         began, doubt = time.perf_counter(), self._checked(recording)
@@ -360,7 +366,8 @@ _completed = eqx.filter_jit(completed)
 def _like(options: dict[str, Any], camera: dict[str, Any]) -> TrainedReconstruction:
     """The shapes of a file's arrays."""
     count = int(options["noises"])
-    sizes = {name: options[name] for name in ("iterations", "colours")}
+    names = ("iterations", "colours", "method")  # files of versions before have no method
+    sizes = {name: options[name] for name in names if name in options}
     made = TrainedOptions(**sizes, widths=tuple(options["widths"]))
     network = eqx.filter_eval_shape(
         lambda key: UNet(_IMAGES * made.colours, made.colours, made.widths, key=key),
@@ -370,7 +377,8 @@ def _like(options: dict[str, Any], camera: dict[str, Any]) -> TrainedReconstruct
     if camera:
         (rows, columns), shape = camera["psf_shape"], tuple(camera["portrait"])
         portrait = CameraPortrait(camera["digest"], (rows, columns), jnp.zeros(shape))
-    like = TrainedReconstruction(PhysicsStep(jnp.zeros(count), made.iterations), network, portrait)
+    physics = PhysicsStep(jnp.zeros(count), made.iterations, made.method)
+    like = TrainedReconstruction(physics, network, portrait)
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
 
 
