@@ -70,7 +70,7 @@ def test_inverted_captures_are_named_and_the_advice_mends_the_image(noise, backg
 
 
 def test_a_psf_of_another_size_is_found():
-    larger = scipy.ndimage.zoom(PSF, 1.06, order=1)
+    larger = np.asarray(scipy.ndimage.zoom(PSF, 1.06, order=1), float)
     found = tc.reconstruct(tc.Recording([CAPTURE], tc.Psfs(larger[None])), SOLVER)
     assert "has 0.94 times the size; refine it" in found.reason
 
