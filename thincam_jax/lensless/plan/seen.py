@@ -23,7 +23,14 @@ from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.field import points_needed, tangents_of
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.base import AbstractMask, has_few_terms
-from thincam_jax.lensless.method import CLOSED, Model, PsfMethod, models_of, psf_method
+from thincam_jax.lensless.method import (
+    CLOSED,
+    LATTICE_POINTS,
+    Model,
+    PsfMethod,
+    models_of,
+    psf_method,
+)
 from thincam_jax.lensless.propagation.separable import with_nodes
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
 from thincam_jax.lensless.resolve import (
@@ -166,6 +173,8 @@ class SampledProbe:
     ) -> Transfer:
         """H of the PSF as a plan computes it; with `at`, about the ray of that point."""
         grid = self.camera.sensor.grid
+        if method.model in CLOSED:  # compared with each other at the fewest points
+            method = replace(method, nodes=method.nodes or LATTICE_POINTS)
         h = spectral_psf(self.camera, [(wavelength, 1.0)], distance, method, grid, at)
         return image_spectrum(np.asarray(h, float)[None], self.frequencies)[0]
 
