@@ -1,0 +1,287 @@
+"""Which mask, when every cell of 11 µm is free on pixels of 5.5 µm?
+=====================================================================
+
+The thesis' sensor has 1024² pixels of 5.5 µm. Here all 262,144 cells of a binary mask are free:
+exact diffraction of all of them, the error of the best linear image over the field, and its slope
+take 0.6 seconds. What is found stands beside the thesis' methods A and B, the best opening,
+MURA, random cells and lens of such cells, at equal light and time, and is judged on photographs.
+Lengths are in mm.
+"""
+
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import scipy.stats
+from PIL import Image
+
+import thincam_jax as tc
+from thincam_jax.design.cell_masks import CellMasks, CellOptics, drawn_cells
+from thincam_jax.design.cell_search import CellSettings, find_cells
+from thincam_jax.design.expected_error import ExpectedError
+from thincam_jax.design.limit import limit
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.imaging.targets.images import sample_images
+from thincam_jax.units import nm, um
+
+SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
+FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "full_size_design"
+FIGURES.mkdir(parents=True, exist_ok=True)
+
+# %%
+# Camera, scene and light
+# -----------------------
+#
+# A sensor 5.63 mm wide, 6.5 mm behind masks as wide; an object 179 mm wide at 250 mm. All captures
+# of a design share one exposure: so many electrons of a pixel from each mm² of open aperture before
+# a white scene, and 8 electrons of read noise in each.
+
+full = SIZE == "full"
+count, pitch, cells, cell = (1024, 5.5 * um, 512, 11 * um) if full else (64, 22 * um, 32, 44 * um)
+settings = CellSettings() if full else CellSettings(8, 2, 6, flips=4)
+lights = {"plenty of light": 2e5, "little light": 2e3} if full else {"plenty of light": 2e6}
+distance, far, light = 6.5, 250.0, 500 * nm
+width, across, seen = count * pitch, 179 * count * pitch / 5.632, 8 if full else 2
+space = CellMasks(cell, cells, distance=distance, wavelength=light)
+
+
+def setup_of(electrons):
+    noise, prior = tc.design.PhotonNoise(electrons, 8.0), tc.design.PowerLaw(2.8)
+    return tc.design.Setup(pitch, width, far, across, noise=noise, prior=prior)
+
+
+# %%
+# Rivals
+# ------
+#
+# One number of each is tuned by the same expected error. Cells of a lens are open where the wave of
+# a point would arrive in phase: rings of half a wave, no finer than a cell.
+
+place = (np.arange(cells) - (cells - 1) / 2) * float(cell)
+squared = place[:, None] ** 2 + place**2
+zones = np.cos(np.pi / (float(light) * distance) * (1 + distance / far) * squared) > 0
+
+
+def squares(pattern, side):
+    """Squares of cells in the middle of a mask."""
+    mask = np.kron(pattern, np.ones((side, side)))
+    before = (cells - len(mask)) // 2
+    return np.pad(mask, (before, cells - len(mask) - before)) > 0
+
+
+def mura(prime, side):
+    return squares(np.asarray(tc.ModifiedUniformlyRedundantArray(prime, 1.0).cells), side)
+
+
+primes = [p for p in (5, 7, 11, 13, 17, 23, 31, 43, 61, 101, 127, 251, 509) if p <= cells]
+rng = np.random.default_rng(1)
+rivals = {
+    "one opening": [squares(np.ones((n, n)), 1) for n in (2, 4, 5, 6, 7, 8, 9, 10, 12, 14, 20, 30)],
+    "MURA": [mura(p, n) for p in primes for n in (1, 2, 4, 8, 16) if p * n <= cells],
+    "random cells": [
+        drawn_cells(space, rng).reshape(cells, cells) for _ in range(240 if full else 8)
+    ],
+    "lens of zones": [zones & (squared < r**2) for r in (0.06, 0.08, 0.1, 0.12, 0.15, 0.18, 0.25)],
+}
+
+
+@jax.jit
+def quick(mask, optics, error):
+    return error([optics(mask)])
+
+
+def best(masks, optics, error):
+    return min((jnp.asarray(m, float) for m in masks), key=lambda m: quick(m, optics, error))
+
+
+# %%
+# The search
+# ----------
+#
+# It begins at the best of random cells, and keeps its state in a folder.
+
+designs, phases = {}, (0.0, 1.5 * np.pi) * 2
+for name, electrons in lights.items():
+    setup, optics = setup_of(electrons), CellOptics(space, far, float(pitch))
+    error = ExpectedError(setup, [optics.grid], [distance])
+    found = find_cells(setup, space, settings, folder=FIGURES / name.replace(" ", "_"))
+    kinds = {kind: best(masks, optics, error) for kind, masks in rivals.items()}
+    kinds["cells by gradient"] = jnp.asarray(found.masks[0].amplitude)
+    designs[name] = {kind: ([tc.SampledMask(m, cell)], [distance]) for kind, m in kinds.items()}
+    plates = (
+        ("method A", [25.0] * 4, [5.0, 5.0, 6.5, 6.5]),
+        ("method B", [25.0, 25.0, 21.0, 21.0], [6.5] * 4),
+    )
+    for kind, beta, distances in plates:
+        masks = [
+            tc.FresnelZoneAperture(b, p, width=width) for b, p in zip(beta, phases, strict=True)
+        ]
+        designs[name][kind] = masks, distances
+    print(f"{name}: {found.evaluations} evaluations")
+
+# %%
+# Expected errors, by exact PSFs
+# ------------------------------
+#
+# On a grid wider than the sensor, which sees of each point of the object another part of the PSF;
+# with a rim of zeros, for close frequencies.
+
+sensor, rim, errors = tc.Sensor((count, count), pitch), count // 6, {}
+wide, padded = (tc.Sensor((n, n), pitch) for n in (count + 2 * rim, 2 * count))
+zeros = padded.shape[0] // 2 - wide.shape[0] // 2
+for name, electrons in lights.items():
+    for kind, (masks, distances) in designs[name].items():
+        cameras = [tc.LenslessCamera(m, wide, d) for m, d in zip(masks, distances, strict=True)]
+        psfs = [tc.psf(camera, wavelength=light, object_distance=far) for camera in cameras]
+        psfs = [jnp.pad(h, zeros) for h in psfs]
+        error = ExpectedError(setup_of(electrons), [padded.grid] * len(psfs), distances)
+        errors[name, kind] = 10 * np.log10(float(jax.jit(lambda h, e: e(h))(psfs, error)))
+        opened = f", open {float(jnp.mean(masks[0].amplitude)):.4f}" if len(masks) == 1 else ""
+        print(f"{name}, {kind}: {errors[name, kind]:.2f} dB{opened}")
+
+# %%
+# No shadow has less than the limit; a mask that focuses can have.
+
+plate = tc.design.shots([25.0], distance, [0.0], wavelength=light, width=width)
+free = tc.design.DesignSpace(plate, (tc.design.Variable("beta", 5.0, 30.0, (0,)),))
+limits = {}
+for name, electrons in lights.items():
+    setup = setup_of(electrons)
+    limits[name] = limit(tc.design.design_problem(tc.design.BayesError(), free, setup, np.eye(1)))
+    print(f"{name}: limit of shadows {limits[name].decibels:.2f} dB")
+
+# %%
+# Photographs
+# -----------
+#
+# Captures on all pixels, by exact PSFs; reconstructed, by total variation as it comes, from sums of
+# 2 × 2 pixels, which hold half of the Nyquist band.
+
+coarse = tc.Sensor((count // 2,) * 2, 2 * pitch)
+field = 2 * round(across / far * distance / float(pitch) / 4)  # of those, centred as they are
+
+
+def photograph(name):
+    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
+    side = min(image.shape)
+    top, left = ((n - side) // 2 for n in image.shape)
+    image = resize(image[top : top + side, left : left + side], (2 * field, 2 * field))
+    return image * 0.4 / image.mean()
+
+
+def halved(images):
+    return images.reshape(*images.shape[:-2], images.shape[-2] // 2, 2, -1, 2).mean((-3, -1))
+
+
+others = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
+names = [name for name in sample_images() if name not in others][:seen]
+scenes = np.stack([photograph(name) for name in names]).astype(np.float32)
+plane = tc.ImagePlane(scenes, far, 2 * field * float(pitch) * far / distance)
+truth = halved(scenes)[..., ::-1, ::-1]
+
+
+def judged(masks, distances, electrons):
+    """PSNR of each photograph, dB."""
+    pairs = [*zip(masks, distances, strict=True)]
+    counted, noise = electrons / len(pairs), tc.PoissonGaussianNoise(8.0)
+    keys, captures = jax.random.split(jax.random.key(0), len(pairs)), []
+    for key, (mask, d) in zip(keys, pairs, strict=True):
+        clean = tc.capture(tc.LenslessCamera(mask, sensor, d), tc.Scene(plane, light))
+        captures.append(halved(noise.add(key, clean, jnp.full((len(scenes), 1, 1), counted))))
+    optics = tc.Cameras(
+        [tc.LenslessCamera(mask, coarse, d) for mask, d in pairs],
+        wavelength=light,
+        object_distance=far,
+        field_shape=(field, field),
+    )
+    recording = tc.Recording(captures, optics)
+    image = recording.oriented(tc.reconstruct(recording, tc.AdmmTV()).image)
+    return -10 * np.log10(np.mean((np.asarray(image, float) - truth) ** 2, axis=(-2, -1)))
+
+
+levels = {
+    (name, kind): judged(masks, distances, lights[name])
+    for name in lights
+    for kind, (masks, distances) in designs[name].items()
+}
+
+
+def gain(name, kind, over):
+    """Low end of the 95 % interval over the photographs, mean, and high end, dB (Student's t)."""
+    each = levels[name, kind] - levels[name, over]
+    half = scipy.stats.t.ppf(0.975, len(each) - 1) * each.std(ddof=1) / len(each) ** 0.5
+    return each.mean() + half * np.array([-1, 0, 1])
+
+
+for name in lights:
+    for kind in designs[name]:
+        low, middle, high = gain(name, "cells by gradient", kind)
+        print(
+            f"{name}: PSNR by {kind} {levels[name, kind].mean():.2f} dB; "
+            f"cells by gradient {middle:+.2f} dB ({low:+.2f} to {high:+.2f})"
+        )
+
+# %%
+marks, order = dict(zip(lights, ("ws", "ko"), strict=False)), [*designs[[*lights][0]]]
+figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
+for name, mark in marks.items():
+    rows = np.arange(len(order))
+    panels[0].axvline(limits[name].decibels, color="k" if mark == "ko" else "0.6", lw=0.8)
+    panels[0].plot([errors[name, kind] for kind in order], rows, mark, mec="k", label=name)
+    means = [levels[name, kind].mean() for kind in order]
+    panels[1].plot(means, rows, mark, mec="k", label=name)
+panels[0].set_yticks(range(len(order)), order)
+panels[0].invert_yaxis()
+panels[0].set(xlabel="expected error of the best linear image (dB); lines: limit of shadows")
+panels[1].set(xlabel="PSNR of photographs by total variation (dB)")
+for ax in panels:
+    ax.grid(axis="y", color="0.9")
+panels[1].legend()
+figure.savefig(FIGURES / "full-size.png", dpi=100)
+
+# %%
+# A mask and its PSF
+# ------------------
+#
+# What is found, for the most light: rings about many centres, each a lens that casts a point.
+
+bright = [*lights][0]
+(mask,), _ = designs[bright]["cells by gradient"]
+camera, half = tc.LenslessCamera(mask, sensor, distance), min(0.6, width / 2)
+psf = tc.psf(camera, wavelength=light, object_distance=far)
+extent = (-width / 2, width / 2, width / 2, -width / 2)
+figure, panels = plt.subplots(1, 3, figsize=(9, 3.3), layout="constrained")
+for ax in panels[:2]:
+    ax.imshow(np.asarray(mask.amplitude), cmap="gray", extent=extent, interpolation="nearest")
+panels[1].set(xlim=(-half, half), ylim=(half, -half))
+middle = panels[2].imshow(np.sqrt(psf), cmap="gray", extent=extent)
+panels[2].set(xlim=(-half, half), ylim=(half, -half))
+titles = "cells, open ones white", "their middle", "PSF there, square root of irradiance"
+for ax, title in zip(panels, titles, strict=True):
+    ax.set(xlabel="x (mm)")
+    ax.set_title(title, fontsize=10)
+panels[0].set(ylabel="y (mm)")
+figure.colorbar(middle, ax=panels[2], label="√ of irradiance over the open mask's")
+figure.savefig(FIGURES / "full-size-mask.png", dpi=100)
+Image.fromarray(np.asarray(mask.amplitude) > 0).save(FIGURES / "full-size-cells.png")
+
+# %%
+# How well must it be made?
+# -------------------------
+#
+# The same cells at another distance and in another light, each reconstructed by its own PSF.
+
+changes = {"distance": (0.1, 0.3, 1.0), "wavelength": (10 * nm, 30 * nm)}
+for name, steps in changes.items():
+    for step in steps:
+        moved = [space.replace(**{name: getattr(space, name) + s * step}) for s in (-1, 1)]
+        losses = []
+        for one in moved:
+            optics, d = CellOptics(one, far, float(pitch)), float(one.distance)
+            error = ExpectedError(setup_of(lights[bright]), [optics.grid], [d])
+            value = 10 * np.log10(float(quick(mask.amplitude, optics, error)))
+            losses.append(value - errors[bright, "cells by gradient"])
+        print(f"{name} ± {float(step):g} mm: {losses[0]:+.2f} and {losses[1]:+.2f} dB")

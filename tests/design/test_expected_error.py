@@ -1,0 +1,106 @@
+"""Expected error of PSFs: written out in NumPy, beside the closed form, and its slope."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.polynomial.legendre import leggauss
+
+import thincam_jax as tc
+from thincam_jax.design import PhotonNoise, PowerLaw, Setup, SignalNoise
+from thincam_jax.design.expected_error import ExpectedError
+from thincam_jax.design.objectives import bayes_error, channels
+from thincam_jax.design.setup import Quadrant
+
+PITCH, WIDTH, FAR, ACROSS = 0.04, 1.92, 100.0, 60.0
+
+
+def setup(noise=None, **changed):
+    given = {"noise": noise or PhotonNoise(1e5, 20.0), "prior": PowerLaw(2.5)} | changed
+    return Setup(PITCH, WIDTH, FAR, ACROSS, **given)
+
+
+def written_out(psfs, grids, distances, light, read, nodes=2):
+    """The error from its definition: sums over pixels for each frequency and point of the field."""
+    field, farthest = ACROSS / FAR, max(distances)
+    highest = farthest / (4 * PITCH)
+    nu = np.arange(-int(highest * 4), int(highest * 4) + 1) / 4.0  # finer than any fringe
+    nu = nu[abs(nu) <= highest]
+    prior = (1 + (nu[:, None] ** 2 + nu**2) * field**2) ** -1.25
+    density = 0.25 * prior / np.sum(prior * 0.25**2)
+    places, weights = leggauss(nodes)
+    total, lights, powers = 0.0, np.zeros(len(psfs)), {}
+    for i in range(nodes):
+        for j in range(nodes):
+            for k, (psf, (y, x), d) in enumerate(zip(psfs, grids, distances, strict=True)):
+                seen = [
+                    np.clip((WIDTH / 2 - abs(a + places[n] * field * d / 2)) / PITCH + 0.5, 0, 1)
+                    for n, a in ((i, y), (j, x))
+                ]
+                part = psf * seen[0][:, None] * seen[1] * PITCH**2
+                lights[k] += weights[i] * weights[j] / 4 * part.sum() * (field * d / WIDTH) ** 2
+                down, across = (np.exp(-2j * np.pi * np.outer(nu / d, a)) for a in (y, x))
+                powers[i, j, k] = abs(down @ part @ across.T) ** 2
+    exposure = 1 / len(psfs)
+    noise = lights / (light * exposure) + (read / (light * exposure)) ** 2
+    for i in range(nodes):
+        for j in range(nodes):
+            known = sum(
+                powers[i, j, k] * d**2 / (noise[k] * PITCH**2) for k, d in enumerate(distances)
+            )
+            left = np.sum(density / (1 + density * known)) / np.sum(density)
+            total += weights[i] * weights[j] / 4 * left
+    return total
+
+
+def test_is_what_its_definition_says():
+    """Captures at two distances, on grids that are not square; frequencies half as far apart."""
+    rng, distances = np.random.default_rng(0), (3.0, 4.0)
+    grids = [tc.Grid((40, 34), PITCH), tc.Grid((50, 60), PITCH)]
+    psfs = [rng.random(grid.shape) ** 8 for grid in grids]
+    error = ExpectedError(setup(), grids, distances, nodes=2)
+    axes = [(np.asarray(grid.y), np.asarray(grid.x)) for grid in grids]
+    wanted = written_out(psfs, axes, distances, 1e5, 20.0)
+    assert 0.02 < wanted < 0.9
+    assert error([jnp.asarray(h) for h in psfs]) == pytest.approx(wanted, rel=0.05)
+
+
+@pytest.mark.parametrize("noise", [PhotonNoise(1e5, 2e3), SignalNoise(25.0)])
+def test_without_an_edge_it_is_that_of_the_closed_form(noise):
+    # Of read noise, for the closed form takes the light of a plate from its mean alone.
+    base = tc.design.shots([18.0, 12.0], 3.0, [0.5], wavelength=5e-4, width=1.6)
+    uncut = setup(noise, crop=False)
+    known = channels(base, uncut, jnp.eye(2), Quadrant(3.0 / (4 * PITCH), 256))
+    sensor = tc.Sensor((512, 512), PITCH)
+    cameras = base.cameras(sensor)
+    psfs = [tc.psf(camera, wavelength=5e-4, object_distance=FAR) for camera in cameras]
+    found = ExpectedError(uncut, [sensor.grid] * 2, [3.0] * 2)(psfs, exposures=[1.0, 1.0])
+    assert 10 * np.log10(found / bayes_error(known)) == pytest.approx(0.0, abs=0.1)
+
+
+def test_slope_batches_and_new_values():
+    sensor, traces = tc.Sensor((48, 48), PITCH), []
+    errors = [ExpectedError(setup(PhotonNoise(n)), [sensor.grid], [3.0]) for n in (1e4, 1e5)]
+    rng = np.random.default_rng(1)
+    psf, way = (jnp.asarray(rng.random((48, 48))) for _ in range(2))
+
+    @jax.jit
+    def cost(h, error):
+        traces.append(1)
+        return error([h])
+
+    assert cost(psf, errors[1]) < cost(psf, errors[0])
+    assert len(traces) == 1
+    slope = jnp.sum(jax.grad(cost)(psf, errors[0]) * way)
+    ends = (cost(psf + s * way, errors[0]) for s in (1e-4, -1e-4))
+    assert float(slope) == pytest.approx(float(next(ends) - next(ends)) / 2e-4, rel=1e-6)
+    both = jax.vmap(lambda h: errors[0]([h]))(jnp.stack([psf, way]))
+    assert both[1] == pytest.approx(float(errors[0]([way])), rel=1e-12)
+
+
+def test_what_it_refuses():
+    grid = tc.Grid((8, 8), 3 * PITCH)
+    with pytest.raises(ValueError, match=r"at most two pixels, 0\.08 mm"):
+        ExpectedError(setup(), [grid], [3.0])
+    with pytest.raises(ValueError, match="1 grids and 2 distances"):
+        ExpectedError(setup(), [grid], [3.0, 4.0])
