@@ -41,7 +41,7 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 
 full = SIZE == "full"
 count, pitch, cells, cell = (1024, 5.5 * um, 512, 11 * um) if full else (64, 22 * um, 32, 44 * um)
-settings = CellSettings() if full else CellSettings(8, 2, 6, flips=4)
+settings = CellSettings() if full else CellSettings(8, 2, 4, flips=8)
 lights = {"plenty of light": 2e5, "little light": 2e3} if full else {"plenty of light": 2e6}
 distance, far, light = 6.5, 250.0, 500 * nm
 width, across, seen = count * pitch, 179 * count * pitch / 5.632, 8 if full else 2
@@ -101,7 +101,7 @@ def best(masks, optics, error):
 # The search
 # ----------
 #
-# It begins at the best of random cells, and keeps its state in a folder.
+# It begins at random cells, and keeps its state in a folder.
 
 designs, phases = {}, (0.0, 1.5 * np.pi) * 2
 for name, electrons in lights.items():
@@ -109,7 +109,7 @@ for name, electrons in lights.items():
     error = ExpectedError(setup, [optics.grid], [distance])
     found = find_cells(setup, space, settings, folder=FIGURES / name.replace(" ", "_"))
     kinds = {kind: best(masks, optics, error) for kind, masks in rivals.items()}
-    kinds["cells by gradient"] = jnp.asarray(found.masks[0].amplitude)
+    kinds["cells found"] = jnp.asarray(found.masks[0].amplitude)
     designs[name] = {kind: ([tc.SampledMask(m, cell)], [distance]) for kind, m in kinds.items()}
     plates = (
         ("method A", [25.0] * 4, [5.0, 5.0, 6.5, 6.5]),
@@ -218,10 +218,10 @@ def gain(name, kind, over):
 
 for name in lights:
     for kind in designs[name]:
-        low, middle, high = gain(name, "cells by gradient", kind)
+        low, middle, high = gain(name, "cells found", kind)
         print(
             f"{name}: PSNR by {kind} {levels[name, kind].mean():.2f} dB; "
-            f"cells by gradient {middle:+.2f} dB ({low:+.2f} to {high:+.2f})"
+            f"cells found {middle:+.2f} dB ({low:+.2f} to {high:+.2f})"
         )
 
 # %%
@@ -235,8 +235,8 @@ for name, mark in marks.items():
     panels[1].plot(means, rows, mark, mec="k", label=name)
 panels[0].set_yticks(range(len(order)), order)
 panels[0].invert_yaxis()
-panels[0].set(xlabel="expected error of the best linear image (dB); lines: limit of shadows")
-panels[1].set(xlabel="PSNR of photographs by total variation (dB)")
+panels[0].set(xlabel="expected error (dB); lines: limit of shadows")
+panels[1].set(xlabel="PSNR of photographs (dB)")
 for ax in panels:
     ax.grid(axis="y", color="0.9")
 panels[1].legend()
@@ -246,10 +246,10 @@ figure.savefig(FIGURES / "full-size.png", dpi=100)
 # A mask and its PSF
 # ------------------
 #
-# What is found, for the most light: rings about many centres, each a lens that casts a point.
+# What is found, for the most light: rings about centres, each of them a lens that casts a point.
 
 bright = [*lights][0]
-(mask,), _ = designs[bright]["cells by gradient"]
+(mask,), _ = designs[bright]["cells found"]
 camera, half = tc.LenslessCamera(mask, sensor, distance), min(0.6, width / 2)
 psf = tc.psf(camera, wavelength=light, object_distance=far)
 extent = (-width / 2, width / 2, width / 2, -width / 2)
@@ -259,12 +259,12 @@ for ax in panels[:2]:
 panels[1].set(xlim=(-half, half), ylim=(half, -half))
 middle = panels[2].imshow(np.sqrt(psf), cmap="gray", extent=extent)
 panels[2].set(xlim=(-half, half), ylim=(half, -half))
-titles = "cells, open ones white", "their middle", "PSF there, square root of irradiance"
+titles = "cells, open ones white", "their middle", "PSF there"
 for ax, title in zip(panels, titles, strict=True):
     ax.set(xlabel="x (mm)")
     ax.set_title(title, fontsize=10)
 panels[0].set(ylabel="y (mm)")
-figure.colorbar(middle, ax=panels[2], label="√ of irradiance over the open mask's")
+figure.colorbar(middle, ax=panels[2], label="√ of irradiance, open mask 1")
 figure.savefig(FIGURES / "full-size-mask.png", dpi=100)
 Image.fromarray(np.asarray(mask.amplitude) > 0).save(FIGURES / "full-size-cells.png")
 
@@ -283,5 +283,5 @@ for name, steps in changes.items():
             optics, d = CellOptics(one, far, float(pitch)), float(one.distance)
             error = ExpectedError(setup_of(lights[bright]), [optics.grid], [d])
             value = 10 * np.log10(float(quick(mask.amplitude, optics, error)))
-            losses.append(value - errors[bright, "cells by gradient"])
+            losses.append(value - errors[bright, "cells found"])
         print(f"{name} ± {float(step):g} mm: {losses[0]:+.2f} and {losses[1]:+.2f} dB")

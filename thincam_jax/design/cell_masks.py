@@ -160,7 +160,7 @@ class CellOptics(eqx.Module):
 
 
 def drawn_cells(masks: CellMasks, rng: np.random.Generator) -> Bool[np.ndarray, "capture cell"]:
-    """Random masks: 8² squares of cells or more, of any side and open part, in the middle."""
+    """Random masks: squares of cells, of any side, number and open part, in the middle."""
     if masks.rings:
         width = int(rng.integers(1, max(2, masks.free // 4)))
         opened = rng.random((masks.captures, masks.free // width + 1)) < rng.uniform(0.05, 1)
@@ -169,7 +169,7 @@ def drawn_cells(masks: CellMasks, rng: np.random.Generator) -> Bool[np.ndarray, 
     def one():
         side = int(rng.integers(1, min(17, masks.count + 1)))
         most = masks.count // side
-        across = int(np.exp(rng.uniform(np.log(min(8, most)), np.log(most + 1))))
+        across = int(np.exp(rng.uniform(0, np.log(most + 1))))
         opened = rng.random((across, across)) < np.exp(rng.uniform(np.log(0.01), 0))
         cells = np.kron(opened, np.ones((side, side), bool))
         before = (masks.count - len(cells)) // 2

@@ -2,8 +2,10 @@
 
 Each evaluation is exact diffraction of all cells and the error of the best linear image over the
 field (`ExpectedError`), with its slope at some four times the cost. A search begins at the best of
-random masks, descends by Adam while the levels harden, and at the end flips cells of binary masks
-as long as that helps. It can be ended at any time and goes on from its folder.
+random masks, descends by Adam while the levels harden, and flips cells of binary masks, both of
+those found and of the best random ones, as long as that helps: flips turn one opening into a lens,
+where a descent ends in a crowd of worse ones (docs/measured/full_size.md). It can be ended at any
+time and goes on from its folder.
 """
 
 import hashlib
@@ -48,15 +50,15 @@ class CellSettings:
     - `draws`: random masks; `starts`: how many of the best of these it begins at, to go on from the
       one that has the least error after a quarter of `steps`.
     - `steps`: descents' steps at each of three steepnesses; `rate`: change of the numbers a step.
-    - `flips`: evaluations at the end that flip cells of binary levels.
+    - `flips`: most evaluations that then flip cells of binary levels, as long as that helps.
     - `seed`: seed for all that is random.
     """
 
-    draws: Annotated[int, whole(1, 100_000)] = 60
-    starts: Annotated[int, whole(1, 1_000)] = 6
-    steps: Annotated[int, whole(1, 100_000)] = 100
+    draws: Annotated[int, whole(1, 100_000)] = 100
+    starts: Annotated[int, whole(1, 1_000)] = 3
+    steps: Annotated[int, whole(1, 100_000)] = 40
     rate: Annotated[float, quantity(positive=True)] = 0.1
-    flips: Annotated[int, whole(0, 100_000)] = 40
+    flips: Annotated[int, whole(0, 100_000)] = 100
     seed: Annotated[int, whole(0)] = 0
 
     def __post_init__(self):
@@ -151,10 +153,10 @@ def find_cells(
             tell(step, settings.steps * len(_STEEPNESS), _said(state.history[-1]))
             if file is not None and (step + 1) % _KEPT_EVERY == 0:
                 state.write(file, _described(setup, space, settings, start))
-        numbers, error, flips = problem.flipped(state.numbers, settings.flips)
-        if error > state.random:
-            numbers, error, more = problem.flipped(jnp.asarray(state.best), settings.flips)
-            flips += more
+        # From where the descent ends, and from the best random masks: either can be the better.
+        ends = [problem.flipped(one, settings.flips) for one in (state.numbers, state.best)]
+        numbers, error, _ = min(ends, key=lambda end: end[1])
+        flips = sum(taken for _, _, taken in ends)
     tried = 0 if start is not None else min(settings.starts, settings.draws) - 1
     slopes = len(state.history) + tried * _trial(settings) + flips
     count = settings.draws + 3 * slopes
