@@ -1,5 +1,5 @@
-"""Which mask, when every cell of 11 µm is free on pixels of 5.5 µm?
-=====================================================================
+"""Which mask, if every cell of 11 µm is free?
+===========================================
 
 The thesis' sensor has 1024² pixels of 5.5 µm. Here all 262,144 cells of a binary mask are free:
 exact diffraction of all of them, the error of the best linear image over the field, and its slope

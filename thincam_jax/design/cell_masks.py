@@ -119,7 +119,7 @@ class CellOptics(eqx.Module):
     """PSFs of cells on a grid of about the sensor's pixels, see the module.
 
     - `grid`: samples of the PSFs.
-    - `wave`: factor of the spectrum along an axis; `samples`: of the wave in a cell.
+    - `wave`: factor of the spectrum along an axis; `samples`: number of them in a cell.
     """
 
     grid: Grid
@@ -156,7 +156,8 @@ class CellOptics(eqx.Module):
         wave = jnp.fft.ifft2(spectrum * self.wave[:, None] * self.wave)
         power = wave.real**2 + wave.imag**2
         (bins, _), weights = self.grid.shape, jnp.asarray(_BIN, power.dtype)
-        return jnp.einsum("yaxb,a,b->yx", power.reshape(bins, 3, bins, 3), weights, weights)
+        parts = power.reshape(bins, 3, bins, 3)
+        return jnp.einsum("yaxb,a,b->yx", parts, weights, weights, precision="highest")
 
 
 def drawn_cells(masks: CellMasks, rng: np.random.Generator) -> Bool[np.ndarray, "capture cell"]:
