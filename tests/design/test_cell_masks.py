@@ -23,7 +23,7 @@ def drawn(seed=0):
 def transfer(cells, u):
     """The Fourier integral of the PSF at (0, u): sums over overlaps of the cells with themselves.
 
-    ∬ t(y, x + s/2) t(y, x − s/2) exp(−2πi M u x) dy dx with s = λ d u (thesis Eq 3.14).
+    ∬ t(y, x + s/2) t(y, x − s/2) exp(−2πi M u x) dy dx with s = λ d u.
     """
     magnification, s = 1 + 4.0 / FAR, 5e-4 * 4.0 * u
     edges = (np.arange(COUNT + 1) - COUNT / 2) * CELL

@@ -1,15 +1,15 @@
 r"""Masks whose every cell is free, and their PSFs by two Fourier transforms.
 
-The spectrum of cells of side a, with amplitudes t, is periodic but for the factor of one cell,
+The spectrum of cells of side a, with the amplitudes A, is periodic but for the factor of one cell,
 
-.. math:: T(f) = a^2\,\mathrm{sinc}(a f_x)\,\mathrm{sinc}(a f_y) \sum_{ij} t_{ij}
+.. math:: T(f) = a^2\,\mathrm{sinc}(a f_x)\,\mathrm{sinc}(a f_y) \sum_{ij} A_{ij}
     e^{-2\pi j a (i f_y + j f_x)}
 
-and Fresnel diffraction over d of light from a point at t multiplies it by
-:math:`e^{-j\pi\lambda (d/M) f^2}`, M = 1 + d/t, on a sensor that is M times as large (thesis
-Eq 3.14). The wave is sampled three times a pixel and its power averaged over a pixel's cell. What
-the edges of cells send beyond that band, 1/(π² a F) of the light for samples of rate 2F, is left
-out: spectra of random cells are some 5 % off, expected errors up to 0.2 dB.
+and Fresnel diffraction over d, of light from a point at the distance t, multiplies it by
+:math:`e^{-j\pi\lambda (d/M) f^2}`, M = 1 + d/t, on a sensor that is M times as large. The wave is
+sampled three times a pixel and its power averaged over a pixel's cell. What the edges of cells send
+beyond that band, 1/(π² a F) of the light for samples of rate 2F, is left out: spectra of random
+cells are some 5 % off, expected errors up to 0.2 dB.
 """
 
 import math
