@@ -293,7 +293,7 @@ CARDS = {
     "first_image": ("first-image.png", 969, 31, 273),
     "flatcam": ("flatcam.png", 956, 389, 287),
     "free_form_design": ("free-form-masks.png", 127, 0, 127),
-    "full_size_design": ("full-size-mask.png", 10, 10, 200),
+    "full_size_design": ("full-size-mask.png", 332, 52, 224),
     "gradients_through_the_solver": ("solver-gradients.png", 126, 12, 399),
     "in_a_notebook": ("usaf-1951.png", 1182, 326, 186),
     "learned_refocus": ("learned.png", 631, 42, 194),

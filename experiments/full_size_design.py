@@ -285,3 +285,18 @@ for name, steps in changes.items():
             value = 10 * np.log10(float(quick(mask.amplitude, optics, error)))
             losses.append(value - errors[bright, "cells found"])
         print(f"{name} ± {float(step):g} mm: {losses[0]:+.2f} and {losses[1]:+.2f} dB")
+
+# %%
+# What came out
+# -------------
+#
+# - In plenty of light the cells found are 6.3 dB below methods A and B in expected error and 4.9 dB
+#   below the best opening; photographs gain 5.2 and 3.0 dB.
+# - One small lens of rings does it: it is 2.1 dB better than a Fresnel lens of such cells.
+# - In little light random cells are within 0.3 dB: the limit leaves no room.
+
+quoted = {("plenty of light", "cells found"): -23.2, ("little light", "cells found"): -13.6}
+for key, value in quoted.items() if full else ():
+    assert abs(errors[key] - value) < 0.2
+for other, least in {"method B": 1.5, "random cells": 0.5}.items() if full else ():
+    assert gain(bright, "cells found", other)[0] > least
