@@ -126,18 +126,16 @@ for name, electrons in lights.items():
 # Expected errors, by exact PSFs
 # ------------------------------
 #
-# On a grid wider than the sensor, which sees of each point of the object another part of the PSF;
-# with a rim of zeros, for close frequencies.
+# On a grid wider than the sensor, which sees of each point of the object another part of the PSF.
 
-sensor, rim, errors = tc.Sensor((count, count), pitch), count // 6, {}
-wide, padded = (tc.Sensor((n, n), pitch) for n in (count + 2 * rim, 2 * count))
-zeros = padded.shape[0] // 2 - wide.shape[0] // 2
+sensor, errors = tc.Sensor((count, count), pitch), {}
+wide = tc.Sensor((count + count // 6 * 2,) * 2, pitch)
 for name, electrons in lights.items():
     for kind, (masks, distances) in designs[name].items():
         cameras = [tc.LenslessCamera(m, wide, d) for m, d in zip(masks, distances, strict=True)]
         psfs = [tc.psf(camera, wavelength=light, object_distance=far) for camera in cameras]
-        psfs = [jnp.pad(h, zeros) for h in psfs]
-        error = ExpectedError(setup_of(electrons), [padded.grid] * len(psfs), distances)
+        grids = [wide.grid] * len(psfs)
+        error = ExpectedError(setup_of(electrons), grids, distances, padding=1.5)
         errors[name, kind] = 10 * np.log10(float(jax.jit(lambda h, e: e(h))(psfs, error)))
         opened = f", open {float(jnp.mean(masks[0].amplitude)):.4f}" if len(masks) == 1 else ""
         print(f"{name}, {kind}: {errors[name, kind]:.2f} dB{opened}")

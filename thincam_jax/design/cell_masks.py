@@ -144,7 +144,7 @@ class CellOptics(eqx.Module):
         # The middle of the samples is that of the mask.
         ahead = (count - 1) / 2 * cell - (total - 1) / 2 * step
         wave = np.sinc(cell * f) * np.exp(-1j * np.pi * f * (path * f - 2 * ahead))
-        self.wave = as_complex(jnp.asarray(1.0)) * jnp.asarray(wave * self.samples)
+        self.wave = jnp.asarray(wave * self.samples)
         self.grid = Grid((total // 3,) * 2, 3 * step * magnification)
 
     def __call__(self, amplitude: Float[Array, "y x"] | Complex[Array, "y x"]):

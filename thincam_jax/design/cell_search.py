@@ -21,7 +21,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float
 
 from thincam_jax._core.arguments import checked
@@ -33,13 +32,14 @@ from thincam_jax._core.table import Table
 from thincam_jax.design.cell_masks import CellMasks, CellOptics, Numbers, drawn_cells
 from thincam_jax.design.expected_error import ExpectedError
 from thincam_jax.design.setup import Setup
+from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.lensless.masks.sampled import SampledMask
 
 # Of the sigmoid that hardens, in turn; spread of the numbers at the start; steps between two files.
 _STEEPNESS, _SPREAD, _KEPT_EVERY = (2.0, 6.0, 18.0), 0.1, 10
-# Points of the field along an axis, and a rim of zeros as a part of the PSF's side, which makes
-# frequencies close: with fewer a mask fits the points and frequencies that it is judged at.
-_NODES, _RIM = 4, 1 / 8
+# Points of the field along an axis, and padding, which makes frequencies close: with less a mask
+# fits the points and frequencies that it is judged at.
+_NODES, _PADDING = 4, 1.25
 
 
 @checked
@@ -144,15 +144,16 @@ def find_cells(
     if start is not None and np.shape(start) != shape:
         raise ValueError(f"start has shape {np.shape(start)}; give (capture, free) = {shape}")
     file = None if folder is None else Path(folder) / "search.npz"
+    described = _described(setup, space, settings, start)
     with watched("designing") as tell:
-        state = _State.read(file, _described(setup, space, settings, start))
+        state = _State.read(file, described)
         if state is None:
             state = problem.begun(settings, start, tell)
         for step in range(len(state.history), settings.steps * len(_STEEPNESS)):
             state = problem.stepped(state, step, settings)
             tell(step, settings.steps * len(_STEEPNESS), _said(state.history[-1]))
             if file is not None and (step + 1) % _KEPT_EVERY == 0:
-                state.write(file, _described(setup, space, settings, start))
+                state.write(file, described)
         # From where the descent ends, and from the best random masks: either can be the better.
         ends = [problem.flipped(one, settings.flips) for one in (state.numbers, state.best)]
         numbers, error, _ = min(ends, key=lambda end: end[1])
@@ -191,7 +192,7 @@ class _State:
 
     @staticmethod
     def new(numbers: Array, best: Array, random: float) -> "_State":
-        return _State(numbers, _adam().init(numbers), [], best, random)
+        return _State(numbers, adam_method().init(numbers), [], best, random)
 
     def write(self, file: Path, described: str) -> None:
         leaves = map(np.asarray, jax.tree.leaves((self.numbers, self.best, self.adam)))
@@ -216,19 +217,14 @@ class _State:
         if not same:
             raise ValueError(f"{file}: holds a search for other masks; give another folder")
         numbers, best, *rest = leaves
-        adam = jax.tree.unflatten(jax.tree.structure(_adam().init(numbers)), rest)
+        adam = jax.tree.unflatten(jax.tree.structure(adam_method().init(numbers)), rest)
         return _State(numbers, adam, history, best, random)
-
-
-def _adam() -> optax.GradientTransformation:
-    return optax.scale_by_adam()
 
 
 class _Problem(eqx.Module):
     space: CellMasks
     optics: CellOptics
     error: ExpectedError
-    rim: int = eqx.field(static=True)
 
     @staticmethod
     def of(setup: Setup, space: CellMasks) -> "_Problem":
@@ -237,19 +233,16 @@ class _Problem(eqx.Module):
             for length in (setup.object_distance, setup.pitch, space.distance)
         )
         optics = CellOptics(space, far, pitch)
-        bins, captures = optics.grid.shape[0], space.captures
-        rim = math.ceil(_RIM * bins)
-        side = bins + 2 * rim
-        grids = [optics.grid.with_shape((side, side))] * captures
-        error = ExpectedError(setup, grids, [distance] * captures, nodes=_NODES)
-        return _Problem(space, optics, error, rim)
+        grids, distances = [optics.grid] * space.captures, [distance] * space.captures
+        error = ExpectedError(setup, grids, distances, nodes=_NODES, padding=_PADDING)
+        return _Problem(space, optics, error)
 
     def logarithm(self, parts: Numbers) -> Float[Array, ""]:
         """The error's logarithm at levels of cells."""
         amplitudes = self.space.amplitudes(parts)
-        psfs = jax.lax.map(jax.checkpoint(lambda one: self.optics(one)), amplitudes)
-        edge = (self.rim, self.rim)
-        return jnp.log(self.error(jnp.pad(psfs, ((0, 0), edge, edge))))
+        return jnp.log(
+            self.error(jax.lax.map(jax.checkpoint(lambda a: self.optics(a)), amplitudes))
+        )
 
     def begun(
         self, settings: CellSettings, start: Numbers | None, tell: Callable[..., None]
@@ -324,9 +317,7 @@ def _adam_step(problem: _Problem, numbers: Numbers, adam: Any, pair: Float[Array
     """`pair`: steepness and rate."""
 
     def cost(free):
-        return problem.logarithm(problem.space.parts(free, pair[0]))
+        return problem.logarithm(problem.space.parts(free, pair[0])), None
 
-    value, slope = jax.value_and_grad(cost)(numbers)
-    with jax.numpy_dtype_promotion("standard"):  # optax multiplies floats by integers
-        change, adam = _adam().update(slope, adam)
-    return numbers - pair[1] * jnp.asarray(change), adam, value
+    numbers, adam, _, (value, _) = adam_step(cost, numbers, adam, pair[1], adam_method())
+    return numbers, adam, value

@@ -70,9 +70,9 @@ class ExpectedError(eqx.Module):
       one point.
     - `grids`: samples of each capture's PSF, as wide as the PSF, be it wider than the sensor; cells
       of up to two pixels, over which the PSF is averaged, as `tc.psf` gives it on a sensor.
-      Frequencies are d over the widest apart, so that a rim of zeros samples them more closely.
     - `distances`: d of each capture, mm.
     - `nodes`: points of the field along an axis.
+    - `padding`: frequencies are d over so many times the widest PSF apart.
 
     Call it with the PSFs, and with the captures' exposures if they are not alike: 1 is the share of
     `PhotonNoise.electrons`. Frequencies reach up to d/(4p), half of the Nyquist frequency.
@@ -111,6 +111,7 @@ class ExpectedError(eqx.Module):
         distances: Sequence[float | int],
         *,
         nodes: int = 3,
+        padding: float = 1.0,
     ):
         if not grids or len(grids) != len(distances):
             raise ValueError(
@@ -126,7 +127,7 @@ class ExpectedError(eqx.Module):
             )
         # One spacing of angular frequencies for all captures: transforms as long as d asks.
         longest = [max(g.shape) * s / d for g, s, d in zip(grids, steps, distances, strict=True)]
-        spacing, highest = 1 / max(longest), farthest / (4 * pitch)
+        spacing, highest = 1 / (padding * max(longest)), farthest / (4 * pitch)
         lengths = [round(d / (spacing * s)) for d, s in zip(distances, steps, strict=True)]
         if len({*lengths}) == 1:  # others' spacings would differ
             lengths = [fast_shape((lengths[0], 1), real=True)[0]] * len(lengths)

@@ -131,10 +131,10 @@ def _blocks(plane: np.ndarray, same: np.ndarray, step: float) -> np.ndarray:
         part = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in (rows, columns))
         one = labels[part] == number
         edge = np.abs(plane[part][scipy.ndimage.binary_dilation(one, _SQUARE) & ~one] - value)
-        step = edge.min()
-        kinds["sharp"] += [number] * bool(few and step > max(2 * usual, least))
-        kinds["whole"] += [number] * bool(is_alone and is_rectangle and step > spread / 8)
-        kinds["deep"] += [number] * bool(is_large and step > max(least, np.median(edge) / 2))
+        rise = edge.min()
+        kinds["sharp"] += [number] * bool(few and rise > max(2 * usual, least))
+        kinds["whole"] += [number] * bool(is_alone and is_rectangle and rise > spread / 8)
+        kinds["deep"] += [number] * bool(is_large and rise > max(least, np.median(edge) / 2))
     light, found = np.abs(plane - float(np.median(plane))), nothing
     for kind, most in (("sharp", 0.3), ("whole", 0.6), ("deep", 0.3)):
         some = np.isin(labels, kinds[kind])
