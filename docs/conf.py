@@ -137,6 +137,7 @@ MODULES = (
     "lensless.masks.display",
     "lensless.masks.halftone",
     "lensless.masks.phase",
+    "lensless.masks.written",
     "lensless.phase_shift",
     "lensless.propagation.angular_spectrum",
     "measured.bayer",

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design.cell_masks import LEVELS, CellMasks, CellOptics, drawn_cells
+from thincam_jax.design.cell_masks import (
+    LEVELS,
+    CellMasks,
+    CellOptics,
+    drawn_cells,
+    without_lone_cells,
+)
 
 CELL, COUNT, FAR = 0.03, 24, 120.0
 
@@ -70,6 +76,42 @@ def test_psf_is_that_of_the_mask_that_is_made(levels):
 
 def _fine():
     return tc.PsfMethod("separable", nodes=4)
+
+
+def test_cells_of_a_display_leak_and_have_gaps():
+    """Against the displayed mask by the exact model, and what the levels are."""
+    shown = space(fill_factor=0.64, contrast=100.0)
+    numbers = jnp.asarray(drawn(6).reshape(1, -1) - 0.5)
+    (mask,), (amplitude,) = shown.masks(numbers), shown.amplitudes(shown.parts(numbers))
+    np.testing.assert_allclose(np.unique(amplitude), [0.1, 1.0], rtol=1e-6)
+    optics = CellOptics(shown, FAR, 0.005)
+    camera = tc.LenslessCamera(mask, tc.Sensor(optics.grid.shape, optics.grid.pitch), 4.0)
+    exact = tc.psf(camera, wavelength=5e-4, object_distance=FAR, model=_fine())
+    middle = slice(60, -60)
+    difference = (optics(amplitude) - exact)[middle, middle]
+    assert jnp.linalg.norm(difference) < 0.05 * jnp.linalg.norm(exact[middle, middle])
+    whole = CellOptics(space(), FAR, 0.005)(amplitude)
+    assert jnp.linalg.norm((whole - exact)[middle, middle]) > 0.3 * jnp.linalg.norm(exact)
+    with pytest.raises(ValueError, match="are all open: leave the contrast out"):
+        space(levels="phase", contrast=100.0)
+
+
+def test_lone_cells_are_cleared():
+    cells = np.zeros((6, 7))
+    cells[1, 1] = cells[0, 4] = 1  # alone; the second at the rim
+    cells[3:6, 3:6] = 1
+    cells[4, 4] = 0  # a hole
+    cells[2, 2] = cells[3, 2] = 1
+    found = np.asarray(without_lone_cells(jnp.asarray(cells)))
+    wanted = cells.copy()
+    wanted[1, 1] = wanted[0, 4] = 0
+    wanted[4, 4] = 1
+    np.testing.assert_array_equal(found, wanted)
+    board = jnp.asarray(np.indices((8, 8)).sum(0) % 2 * 1.0)
+    assert not without_lone_cells(board).any()
+    several = np.random.default_rng(7).random((2, 30, 30)) < 0.5
+    cleared = np.asarray(without_lone_cells(jnp.asarray(several * 1.0)))
+    np.testing.assert_array_equal(without_lone_cells(jnp.asarray(cleared)), cleared)
 
 
 def test_levels():

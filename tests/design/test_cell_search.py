@@ -6,8 +6,10 @@ import pytest
 
 import thincam_jax.design.cell_search as cell_search
 from thincam_jax.design import PhotonNoise, PowerLaw, Setup
-from thincam_jax.design.cell_masks import CellMasks
+from thincam_jax.design.cell_masks import CellMasks, CellOptics, without_lone_cells
 from thincam_jax.design.cell_search import CellSettings, find_cells
+from thincam_jax.design.expected_error import ExpectedError
+from thincam_jax.design.objectives import Tolerances
 
 SETUP = Setup(0.04, 1.28, 100.0, 40.0, noise=PhotonNoise(3e5, 20.0), prior=PowerLaw(2.5))
 FEW = CellSettings(draws=12, starts=2, steps=10, flips=8)
@@ -44,6 +46,42 @@ def test_flips_never_harm():
     assert with_flips.error < without.error
     cells = np.asarray(with_flips.masks[0].amplitude)
     assert set(np.unique(cells)) == {0.0, 1.0}
+
+
+def test_lone_cells_can_be_forbidden():
+    settings = CellSettings(8, 1, 4, flips=12, lone_cells=False)
+    found = find_cells(SETUP, space(), settings)
+    cells = found.masks[0].amplitude
+    np.testing.assert_array_equal(without_lone_cells(cells), cells)
+    assert found.error < found.random
+    with pytest.raises(ValueError, match="lone_cells=False is for binary levels"):
+        find_cells(SETUP, space(levels="grey"), settings)
+
+
+def test_tolerances_are_kept():
+    """The error that is found is the mean over them, of images made for the exact masks; a mask
+    found for them is better over them than one that is not."""
+    tolerances = Tolerances(distance=0.15, wavelength=1e-5)
+    settings = CellSettings(8, 1, 4, flips=30)
+    robust, exact = (find_cells(SETUP, space(), settings, tolerances=t) for t in (tolerances, None))
+
+    def mean(design):
+        own = CellOptics(space(), 100.0, 0.04)
+        error = ExpectedError(SETUP, [own.grid], [3.0], nodes=4, padding=1.25)
+        psf, total = own(design.masks[0].amplitude), 0.0
+        for changed in (
+            ({"distance": 2.85}, {"distance": 3.15}),
+            ({"wavelength": 4.9e-4}, {"wavelength": 5.1e-4}),
+        ):
+            moved = [CellOptics(space().replace(**c), 100.0, 0.04, own.cells) for c in changed]
+            each = [error([m(design.masks[0].amplitude)], assumed=[psf]) for m in moved]
+            total += sum(each) / 2 - error([psf])
+        return error([psf]) + total
+
+    assert robust.error == pytest.approx(float(mean(robust)), rel=1e-6)
+    assert robust.error < mean(exact)
+    with pytest.raises(ValueError, match="cells have no β"):
+        find_cells(SETUP, space(), settings, tolerances=Tolerances(beta=0.01))
 
 
 def test_goes_on_from_its_folder_to_the_bit(tmp_path, monkeypatch):

@@ -65,6 +65,60 @@ def test_is_what_its_definition_says():
     assert error([jnp.asarray(h) for h in psfs]) == pytest.approx(wanted, rel=0.05)
 
 
+def test_an_image_made_for_other_psfs():
+    """Against a sum over frequencies of filters written out; PSFs of each point of the field."""
+    rng, grid = np.random.default_rng(2), tc.Grid((40, 34), PITCH)
+    h, other, field = rng.random(grid.shape) ** 8, rng.random(grid.shape) ** 8, ACROSS / FAR
+    other = 0.7 * h + 0.3 * other
+    error = ExpectedError(setup(), [grid], [3.0], nodes=2, padding=8.0)
+    frequency = np.arange(-300, 301) / 300.5 * 3.0 / (4 * PITCH)
+    prior = (1 + (frequency[:, None] ** 2 + frequency**2) * field**2) ** -1.25
+    density = 0.25 * prior / np.sum(prior * (frequency[1] - frequency[0]) ** 2)
+    y, x, places = np.asarray(grid.y), np.asarray(grid.x), leggauss(2)[0] * field * 3.0 / 2
+
+    def seen(psf, i, j):
+        inside = [
+            np.clip((WIDTH / 2 - abs(a + places[n])) / PITCH + 0.5, 0, 1)
+            for n, a in ((i, y), (j, x))
+        ]
+        return psf * inside[0][:, None] * inside[1] * PITCH**2
+
+    def noise(psfs):
+        parts = [seen(h, i, j).sum() for (i, j), h in psfs.items()]
+        light = np.mean(parts) * (field * 3.0 / WIDTH) ** 2
+        return (light / 1e5 + (20.0 / 1e5) ** 2) * PITCH**2 / 3.0**2
+
+    def spectrum(psf, i, j):
+        down, across = (np.exp(-2j * np.pi * np.outer(frequency / 3.0, a)) for a in (y, x))
+        return down @ seen(psf, i, j) @ across.T
+
+    def wanted(psfs):
+        total, own, assumed = 0.0, noise(psfs), noise(dict.fromkeys(psfs, other))
+        for (i, j), psf in psfs.items():
+            thought = spectrum(other, i, j)
+            filters = thought.conj() / assumed / (1 / density + abs(thought) ** 2 / assumed)
+            left = density * abs(1 - filters * spectrum(psf, i, j)) ** 2 + abs(filters) ** 2 * own
+            total += np.sum(left) / np.sum(density) / 4
+        return total
+
+    points = [(i, j) for i in range(2) for j in range(2)]
+    found = error([jnp.asarray(h)], assumed=[jnp.asarray(other)])
+    assert found == pytest.approx(wanted(dict.fromkeys(points, h)), rel=0.05)
+    assert found > 1.2 * error([jnp.asarray(h)])
+    every = rng.random((2, 2, 1, 1)) * h
+    found = error([jnp.asarray(every)], assumed=[jnp.asarray(other)])
+    assert found == pytest.approx(wanted({p: every[p] for p in points}), rel=0.05)
+
+
+def test_an_image_made_for_its_own_psfs():
+    rng, grids = np.random.default_rng(3), [tc.Grid((40, 34), PITCH), tc.Grid((50, 60), PITCH)]
+    psfs = [jnp.asarray(rng.random(grid.shape) ** 8) for grid in grids]
+    error = ExpectedError(setup(), grids, [3.0, 4.0])
+    assert error(psfs, assumed=psfs) == pytest.approx(float(error(psfs)), rel=1e-9)
+    alike = [jnp.broadcast_to(h, (3, 3, *h.shape)) for h in psfs]
+    assert error(alike) == pytest.approx(float(error(psfs)), rel=1e-12)
+
+
 @pytest.mark.parametrize("noise", [PhotonNoise(1e5, 2e3), SignalNoise(25.0)])
 def test_without_an_edge_it_is_that_of_the_closed_form(noise):
     # Of read noise, for the closed form takes the light of a plate from its mean alone.

@@ -53,6 +53,9 @@ class CellMasks(Module):
     - `levels`: "binary", open or closed; "grey", amplitudes of 0 to 1; "binary_phase", phases of
       0 and π; "phase", any phase.
     - `rings`: one number for all cells of a ring one cell wide, in place of one for each.
+    - `fill_factor`: part of a cell's area that is open, of a display with dark gaps; None for all.
+    - `contrast`: irradiance through open cells over that through closed ones; None where no light
+      comes through these; for binary and grey levels.
 
     ```python
     from thincam_jax.design.cell_masks import CellMasks
@@ -75,6 +78,16 @@ class CellMasks(Module):
         default="binary", converter=choice(LEVELS), static=True, kw_only=True
     )
     rings: bool = eqx.field(default=False, converter=bool, static=True, kw_only=True)
+    fill_factor: Float[Array, ""] | None = eqx.field(
+        default=None, converter=quantity(check=checks.fraction, optional=True), kw_only=True
+    )
+    contrast: Float[Array, ""] | None = eqx.field(
+        default=None, converter=quantity(least=1.0, optional=True), kw_only=True
+    )
+
+    def __check_init__(self):
+        if self.contrast is not None and "phase" in self.levels:
+            raise ValueError(f"levels {self.levels!r} are all open: leave the contrast out")
 
     @property
     def width(self) -> Float[Array, ""]:
@@ -107,12 +120,14 @@ class CellMasks(Module):
             parts = phasor(jnp.pi * parts)
         elif self.levels == "binary_phase":
             parts = 2 * parts - 1
+        elif self.contrast is not None:
+            parts = parts + (1 - parts) / jnp.sqrt(self.contrast)
         return parts[:, self._ring] if self.rings else parts.reshape(-1, *(self.count,) * 2)
 
     def masks(self, numbers: Numbers) -> list[SampledMask]:
         """The mask of each capture, as it is made."""
         found = self.amplitudes(self.parts(jnp.asarray(numbers)))
-        return [SampledMask(amplitude, self.cell) for amplitude in found]
+        return [SampledMask(one, self.cell, fill_factor=self.fill_factor) for one in found]
 
 
 class CellOptics(eqx.Module):
@@ -127,7 +142,10 @@ class CellOptics(eqx.Module):
     cells: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
 
-    def __init__(self, masks: CellMasks, object_distance: float, pitch: float):
+    def __init__(
+        self, masks: CellMasks, object_distance: float, pitch: float, cells: int | None = None
+    ):
+        """`cells`: along a side of the window; by default those that the light can reach."""
         cell, distance, wavelength = (
             float(decimal_value(length))
             for length in (masks.cell, masks.distance, masks.wavelength)
@@ -135,7 +153,7 @@ class CellOptics(eqx.Module):
         count, magnification = masks.count, 1 + distance / object_distance
         self.samples = 3 * max(1, round(cell * magnification / pitch))
         reach = wavelength * distance / cell**2 * self.samples / 2  # of the band, cells
-        self.cells, _ = fast_shape((math.ceil(count + 2 * _MARGIN * reach), 1))
+        self.cells = cells or fast_shape((math.ceil(count + 2 * _MARGIN * reach), 1))[0]
         total = self.cells * self.samples
         refuse_if_too_large("cells of a mask", _BYTES * total**2, "give fewer or larger cells")
         step = cell / self.samples
@@ -143,7 +161,9 @@ class CellOptics(eqx.Module):
         path = wavelength * distance / magnification
         # The middle of the samples is that of the mask.
         ahead = (count - 1) / 2 * cell - (total - 1) / 2 * step
-        wave = np.sinc(cell * f) * np.exp(-1j * np.pi * f * (path * f - 2 * ahead))
+        open_side = 1.0 if masks.fill_factor is None else float(masks.fill_factor) ** 0.5
+        shape = open_side * np.sinc(open_side * cell * f)
+        wave = shape * np.exp(-1j * np.pi * f * (path * f - 2 * ahead))
         self.wave = jnp.asarray(wave * self.samples)
         self.grid = Grid((total // 3,) * 2, 3 * step * magnification)
 
@@ -177,3 +197,17 @@ def drawn_cells(masks: CellMasks, rng: np.random.Generator) -> Bool[np.ndarray, 
         return np.pad(cells, (before, masks.count - len(cells) - before)).ravel()
 
     return np.stack([one() for _ in range(masks.captures)])
+
+
+def without_lone_cells(cells: Array) -> Array:
+    """Cells (…, y, x) of 0 and 1 of which each has one of its kind beside it.
+
+    Open ones without are closed, then closed ones opened; beyond the mask it is closed.
+    """
+    for lone in (1, 0):
+        around = jnp.pad(cells, [(0, 0)] * (cells.ndim - 2) + [(1, 1)] * 2)
+        beside = (around[..., 2:, 1:-1], around[..., :-2, 1:-1])
+        beside += (around[..., 1:-1, 2:], around[..., 1:-1, :-2])
+        alone = (cells == lone) & jnp.all(jnp.stack(beside) != lone, axis=0)
+        cells = jnp.where(alone, 1 - cells, cells)
+    return cells

@@ -12,23 +12,28 @@ with the noise spectra :math:`\eta_k = \sigma_k^2 p^2` of pixels p wide (thesis 
 ERRATA 3.46) and Gauss-Legendre nodes θ of the field. It is `bayes_error` for PSFs of any kind,
 given by their samples; what the sensor cuts off is lost there, and noise here only where it is
 seen. Photographs keep what it predicts (docs/measured/full_size.md).
+
+An image made with other PSFs than the captures' own has their filters: `mismatch_error`.
 """
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import Grid, fast_shape
+from thincam_jax._core.precision import as_complex, scaled, squared_modulus
 from thincam_jax.design.setup import PhotonNoise, Setup, SignalNoise
 
-Psf = Float[Array, "y x"]
+Psf = Float[Array, "y x"] | Float[Array, "node node y x"]
+Psfs = Sequence[Psf] | Float[Array, "capture y x"]
 
 
 class _Seen(eqx.Module):
@@ -51,13 +56,23 @@ class _Seen(eqx.Module):
     length: int = eqx.field(static=True)
     columns: int = eqx.field(static=True)
 
-    def powers(self, psf: Psf, node) -> tuple[Float[Array, "v u"], Float[Array, ""]]:
-        """|h_θ|² at the frequencies, and the light of h_θ, mm²."""
+    def spectrum(self, psf: Psf, node) -> tuple[Complex[Array, "v u"], Float[Array, ""]]:
+        """h_θ at the frequencies, before `response`, and the light of h_θ, mm²."""
+        psf = psf[node[0], node[1]] if psf.ndim == 4 else psf
         part = psf * self.down[node[0]][:, None] * self.across[node[1]]
         spectrum = jnp.fft.rfft2(part, (self.length, self.length))[:, : self.columns]
         spectrum = jnp.concatenate([spectrum[: self.columns], spectrum[1 - self.columns :]])
-        power = (spectrum.real**2 + spectrum.imag**2) * self.response
-        return power, jnp.sum(part) * self.area
+        return spectrum, jnp.sum(part) * self.area
+
+    def powers(self, psf: Psf, node) -> tuple[Float[Array, "v u"], Float[Array, ""]]:
+        """|h_θ|² at the frequencies, and the light of h_θ, mm²."""
+        spectrum, light = self.spectrum(psf, node)
+        return squared_modulus(spectrum) * self.response, light
+
+    def products(self, psf: Psf, assumed: Psf, node) -> Complex[Array, "v u"]:
+        """h_θ times the assumed one's conjugate at the frequencies."""
+        both = (self.spectrum(one, node)[0] for one in (psf, assumed))
+        return scaled(next(both) * jnp.conj(next(both)), self.response)
 
 
 @checked
@@ -75,7 +90,9 @@ class ExpectedError(eqx.Module):
     - `padding`: frequencies are d over so many times the widest PSF apart.
 
     Call it with the PSFs, and with the captures' exposures if they are not alike: 1 is the share of
-    `PhotonNoise.electrons`. Frequencies reach up to d/(4p), half of the Nyquist frequency.
+    `PhotonNoise.electrons`. A PSF that changes over the field is (node, node, y, x), from the first
+    of its nodes, leggauss(nodes) · field/2, down and across. Frequencies reach up to d/(4p), half
+    of the Nyquist frequency.
 
     ```python
     import thincam_jax as tc
@@ -185,24 +202,50 @@ class ExpectedError(eqx.Module):
 
     def __call__(
         self,
-        psfs: Sequence[Psf] | Float[Array, "capture y x"],
+        psfs: Psfs,
         exposures: Sequence[float] | Float[Array, " capture"] | None = None,
+        assumed: Psfs | None = None,
     ) -> Float[Array, ""]:
-        """Error as a part of the scene's variance: 0 is a perfect image, 1 knows nothing."""
+        """Error as a part of the scene's variance: 0 is a perfect image, 1 knows nothing.
+
+        `assumed`: PSFs of the captures that the image is made with, where these are not their own.
+        """
         count = len(self.captures)
         exposures = [1 / count] * count if exposures is None else exposures
-        places = np.stack(np.meshgrid(*[np.arange(len(self.nodes))] * 2, indexing="ij"), -1)
         over = (self.nodes[:, None] * self.nodes).ravel()
-        known = 0.0
-        for seen, psf, exposure in zip(self.captures, psfs, exposures, strict=True):
-            at = jax.checkpoint(lambda node, seen=seen, psf=psf: seen.powers(psf, node))
-            power, light = jax.lax.map(at, jnp.asarray(places.reshape(-1, 2)))
-            light = self.share * seen.solid * (over @ light)
-            if not self.crop:
-                down, across = seen.middle
-                light = jnp.sum(psf * down[:, None] * across) * seen.area
-            signal = over @ jnp.sum(power * seen.varying * self.density * self.weight, (1, 2))
-            noise = self.noise.variance(light, signal, exposure) * self.pixel
-            known = known + power * (seen.solid / noise)
-        left = self.density * self.weight / (1 + self.density * known)
-        return over @ jnp.sum(left, (1, 2)) / jnp.sum(self.density * self.weight)
+        known: Any
+        known, through, noisy = 0.0, 0j, 0.0
+        thoughts = psfs if assumed is None else assumed
+        every = zip(self.captures, psfs, thoughts, exposures, strict=True)
+        for seen, psf, thought, exposure in every:
+            power, noise = self._seen(seen, thought, exposure)
+            weighted = seen.solid * self.density / noise
+            known = known + power * weighted
+            if assumed is not None:
+                both = self._at_nodes(seen.products, psf, thought)
+                through = through + scaled(both, weighted)
+                noisy = noisy + power * weighted * (self._seen(seen, psf, exposure)[1] / noise)
+        if assumed is None:
+            left = 1 / (1 + known)
+        else:
+            left = (squared_modulus(as_complex(1 + known) - through) + noisy) / (1 + known) ** 2
+        spread = self.density * self.weight
+        return over @ jnp.sum(left * spread, (1, 2)) / jnp.sum(spread)
+
+    def _at_nodes(self, function, *psfs: Psf):
+        """A function of PSFs and a node at every node of the field."""
+        count = np.arange(len(self.nodes))
+        places = np.stack(np.meshgrid(count, count, indexing="ij"), -1).reshape(-1, 2)
+        at = jax.checkpoint(lambda node: function(*psfs, node))
+        return jax.lax.map(at, jnp.asarray(places))
+
+    def _seen(self, seen: _Seen, psf: Psf, exposure) -> tuple[Float[Array, "point v u"], Any]:
+        """Power of a capture's PSF at all nodes, and its noise, mm²."""
+        over = (self.nodes[:, None] * self.nodes).ravel()
+        power, light = self._at_nodes(seen.powers, psf)
+        light = self.share * seen.solid * (over @ light)
+        if not self.crop:
+            down, across = seen.middle
+            light = jnp.sum(psf * down[:, None] * across) * seen.area
+        signal = over @ jnp.sum(power * seen.varying * self.density * self.weight, (1, 2))
+        return power, self.noise.variance(light, signal, exposure) * self.pixel
