@@ -9,7 +9,7 @@ import scipy.signal
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators import CropConvolution, Matrix
 from thincam_jax.reconstruction.other_psf import _FIT, NEGATIVE, RESIZE, TURN, _mirror, without_size
 
 RNG = np.random.default_rng(5)
@@ -88,3 +88,12 @@ def test_light_from_outside_takes_the_place_of_another_size_alone():
     larger, turned = f"{_FIT} has 0.94 times the size; {RESIZE}", f"{_FIT} is upside down; {TURN}"
     assert without_size(f"{rule}; {larger}") == rule and without_size(larger) == ""
     assert without_size(f"{rule}; {turned}") == f"{rule}; {turned}"
+
+
+def test_captures_that_are_no_images_are_not_inverted():
+    """Those of a reduced matrix are numbers of either sign, in one row."""
+    matrix = Matrix(RNG.standard_normal((40, 64)), (8, 8), (1, 40))
+    capture = matrix(jnp.asarray(RNG.random((8, 8)))) + RNG.standard_normal((1, 40))
+    recording = tc.Recording([capture], [matrix], noise_variance=1e-4)
+    found = tc.reconstruct(recording, tc.AdmmTV(iterations=200, tolerance=1e-9))
+    assert NEGATIVE not in found.reason

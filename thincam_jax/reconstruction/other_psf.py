@@ -106,8 +106,9 @@ def inverted(problem: InverseProblem, fine: InverseProblem) -> tuple[InverseProb
 
     - `fine`: the problem on all pixels, whose noise is looked at.
     """
-    growth = _noise_growth(fine)
-    if growth > _GROWS or convolutions(problem) is None or problem.image_shape[-3] > 1:
+    if convolutions(problem) is None or problem.image_shape[-3] > 1:
+        return None
+    if (growth := _noise_growth(fine)) > _GROWS:
         return None
     captures = []
     for capture, weight in zip(problem.captures, problem.weights, strict=True):
