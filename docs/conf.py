@@ -158,6 +158,7 @@ MODULES = (
     "studies.prepared",
     "waveguide.colours",
     "waveguide.distance",
+    "waveguide.display",
     "waveguide.field_of_view",
     "waveguide.lens",
     "waveguide.rays",

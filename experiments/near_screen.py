@@ -19,6 +19,7 @@ import thincam_jax as tc
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.display import tint
 from thincam_jax.waveguide.field_of_view import field_of_view
 from thincam_jax.waveguide.lens import blur_radius
 from thincam_jax.waveguide.studies.screen import ScreenModel, ScreenStudy
@@ -155,6 +156,27 @@ for middle in (25.0, 75.0, 125.0, 175.0):
         f"field {field_of_view(enters, orders=16)}, of the first image alone "
         f"{field_of_view(enters, orders=int(np.argmax(lit > 0)) + 1)}"
     )
+
+# %%
+# A display behind the plate
+# --------------------------
+#
+# The bottom hologram takes light of the display, too, on its way to the user: of white light of an
+# LCD, of a laser's white, and of its green alone, by the angle under which the user looks, down.
+
+lamps = {
+    "LCD": [wg.ColourBand(c * nm, w * nm) for c, w in ((450, 20), (530, 35), (625, 20))],
+    "lasers": [wg.ColourBand(c * nm, 1 * nm) for c in (450, 532, 638)],
+    "532 nm": [wg.ColourBand(532 * nm, 1 * nm)],
+}
+for degrees in (-10.0, -3.0, 0.0, 3.0, 10.0):
+    along = np.array([0.0, np.sin(np.radians(degrees))])
+    words = []
+    for name, primaries in lamps.items():
+        through = tint(film, along, primaries)
+        moved = np.hypot(*through.shift)
+        words.append(f"{name} {100 * through.luminance:.0f} %, Δu′v′ {moved:.3f}")
+    print(f"{degrees:3.0f}°: " + "; ".join(words))
 
 # %%
 

@@ -18,10 +18,29 @@ import PIL.Image
 import PIL.PngImagePlugin
 
 from thincam_jax._core import checks
+from thincam_jax.units import nm
 
 ORIENTATION = 274  # tag of EXIF and TIFF
 _MOST_TAGS = 100  # of a profile
 _PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}  # of an ICC curve, by its kind
+# Centres, widths below and above (nm) and heights of lobes whose sums are the CIE 1931 matching
+# functions x, y, z to about 1 % (Wyman, Sloan and Shirley, JCGT 2(2), 2013).
+_LOBES = (
+    ((599.8, 37.9, 31.0, 1.056), (442.0, 16.0, 26.7, 0.362), (501.1, 20.4, 26.2, -0.065)),
+    ((568.8, 46.9, 40.5, 0.821), (530.9, 16.3, 31.1, 0.286)),
+    ((437.0, 11.8, 36.0, 1.217), (459.0, 26.0, 13.8, 0.681)),
+)
+
+
+def cie_1931(wavelength: np.ndarray) -> np.ndarray:
+    """Colour matching functions x, y, z (…, 3) of light, mm, to about 1 %."""
+    light = wavelength[..., None] / nm
+    found = []
+    for lobes in _LOBES:
+        peak, low, high, height = np.array(lobes).T
+        width = np.where(light < peak, low, high)
+        found.append(np.sum(height * np.exp(-(((light - peak) / width) ** 2) / 2), axis=-1))
+    return np.stack(found, axis=-1)
 
 
 def decode_srgb(codes: np.ndarray) -> np.ndarray:

@@ -69,7 +69,9 @@ class ColourBand(Module):
         return jnp.exp2(-((2 * (wavelength - self.centre) / self.width) ** 2))
 
 
-def _several(kind: type) -> Any:
+def several(kind: type) -> Any:
+    """Check of an attribute: a tuple of one or more objects of a kind."""
+
     def check(name: str, given: Any) -> tuple:
         sound = isinstance(given, list | tuple) and all(isinstance(one, kind) for one in given)
         if not sound or not given:
@@ -92,11 +94,11 @@ class ColourCamera(Module):
     """
 
     cameras: tuple[SeeThroughCamera, ...] = eqx.field(
-        converter=quantity(check=_several(SeeThroughCamera))
+        converter=quantity(check=several(SeeThroughCamera))
     )
-    responses: tuple[ColourBand, ...] = eqx.field(converter=quantity(check=_several(ColourBand)))
+    responses: tuple[ColourBand, ...] = eqx.field(converter=quantity(check=several(ColourBand)))
     primaries: tuple[ColourBand, ...] | None = eqx.field(
-        default=None, converter=quantity(check=_several(ColourBand), optional=True)
+        default=None, converter=quantity(check=several(ColourBand), optional=True)
     )
 
     def __check_init__(self):

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.precision import Precision, allow, cast
@@ -20,6 +21,7 @@ from thincam_jax.waveguide.camera import (
     without_dispersion,
 )
 from thincam_jax.waveguide.colours import ColourCamera, Crosstalk, colour_system
+from thincam_jax.waveguide.display import DisplayLight
 from thincam_jax.waveguide.probe import MARGIN, ColourProbe, ScreenProbe, as_numpy, cross, mean_x
 from thincam_jax.waveguide.system import (
     LitPlane,
@@ -30,7 +32,7 @@ from thincam_jax.waveguide.system import (
 )
 
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
-_SHARES = {"lens": 0.4, "orders": 0.4, "crosstalk": 0.6, "smear": 0.6}
+_SHARES = {"display": 0.4, "lens": 0.4, "orders": 0.4, "crosstalk": 0.6, "smear": 0.6}
 _SHARES |= {"dispersion": 0.4, "precision": 0.4}
 
 
@@ -53,6 +55,8 @@ class ScreenPlan:
     - `shares`: errors of the single decisions. `simpler`: predicted ones of `separable`, and of
       `shift-invariant`: a convolution, with the ghosts of the sensor's middle everywhere.
     - `crosstalk`: argument of `colour_system`, for a `ColourCamera`; `level` then has several.
+    - `background`: the display's light on the sensor, ([channel,] y, x), to add or to subtract;
+      None where there is none, or where it is left out.
     """
 
     camera: SeeThroughCamera | ColourCamera
@@ -70,6 +74,7 @@ class ScreenPlan:
     simpler: dict[str, float]
     crosstalk: Crosstalk | None = None
     defocus: bool = False
+    background: Float[np.ndarray, "*channel y x"] | None = None
 
     @property
     def meets_tolerance(self) -> bool:
@@ -94,6 +99,9 @@ class ScreenPlan:
             lines[-1] = "cross-talk", f"{self.crosstalk}{share['crosstalk']}"
         if "lens" in share:
             lines.append(("lens", f"{'defocus' if self.defocus else 'a pinhole'}{share['lens']}"))
+        if "display" in share:
+            lit = "left out" if self.background is None else "subtract it"
+            lines.append(("display", f"{lit}{share['display']} of the image"))
         return "\n".join(f"{name:<10}  {text}" for name, text in lines)
 
     def system(self) -> Sparse | Separable:
@@ -117,6 +125,7 @@ def plan_screen(
     scene: LitPlane | Sequence[LitPlane],
     *,
     tolerance: float,
+    display: DisplayLight | None = None,
 ) -> ScreenPlan:
     r"""Choose the cheapest model of the capture of a scene to a relative error.
 
@@ -126,7 +135,8 @@ def plan_screen(
     rows and columns can be separated; the precision. All are compared with g₀ at 192 pixels,
     half of them where the object's light arrives; no whole capture is computed. Of a scene of
     several planes, each of as many cells, the light adds up, and rows and columns stay together.
-    Of a lens with an aperture it is decided whether its defocus matters.
+    Of a lens with an aperture it is decided whether its defocus matters; of the light of a
+    `display` behind the plate, whether it has to be subtracted.
 
     Of a `ColourCamera`, before one plane, the cross-talk is decided in place of dispersion and of
     rows and columns, and g₀ has the light of all ways through the gratings and 32 parts of each.
@@ -156,15 +166,24 @@ def plan_screen(
         probe = (ColourProbe if channels else ScreenProbe)(*cast((camera, lit), "float64"))
         share = 1.0
         while True:
-            made = _decided(probe, (camera, plane), tolerance, share)
+            made = _decided(probe, (camera, plane), tolerance, share, display)
             if made.meets_tolerance or share < 0.05:
                 return made
             share /= 2
 
 
-def _decided(probe: ScreenProbe, subjects, tolerance: float, share: float) -> ScreenPlan:
+def _decided(
+    probe: ScreenProbe, subjects, tolerance: float, share: float, display: DisplayLight | None
+) -> ScreenPlan:
     """The cheapest decisions, each within its part of the remaining tolerance."""
     left, shares, found = tolerance * share / MARGIN, {}, probe.reference.sum(axis=0)
+    background, neglected = None, 0.0
+    if display is not None:
+        background = _background(display, subjects[0], probe.level)
+        shares["display"] = probe.length(background[..., *probe.places])
+        if shares["display"] <= left * _SHARES["display"]:
+            background, neglected = None, shares["display"]
+            left -= neglected
     way: dict[str, Any] = {name: values[-1] for name, values in probe.options.items()}
     for name, values in probe.options.items():
         value, size, there = values[-1], math.inf, found
@@ -176,13 +195,14 @@ def _decided(probe: ScreenProbe, subjects, tolerance: float, share: float) -> Sc
         way[name], shares[name], found = value, size, there
         left = max(left - size, 0.0)
     simpler = probe.simpler(way, shares["precision"])
-    apart = simpler.get("separable", math.inf)
+    apart = simpler.get("separable", math.inf) + neglected
+    predicted = probe.predicted(found, shares["precision"]) + neglected
     apart_serves = len(probe.planes) == 1 and apart <= tolerance
     return ScreenPlan(
         camera=subjects[0],
         plane=subjects[1],
         tolerance=tolerance,
-        predicted_error=apart if apart_serves else probe.predicted(found, shares["precision"]),
+        predicted_error=apart if apart_serves else predicted,
         orders=way["orders"],
         all_orders=probe.all_orders,
         samples=way["smear"],
@@ -194,7 +214,15 @@ def _decided(probe: ScreenProbe, subjects, tolerance: float, share: float) -> Sc
         simpler=simpler,
         crosstalk=way.get("crosstalk"),
         defocus=way.get("lens", False),
+        background=background,
     )
+
+
+def _background(display: DisplayLight, camera, level) -> Float[np.ndarray, "*channel y x"]:
+    if not isinstance(camera, ColourCamera):
+        return display.irradiance(camera.sensor.shape, level)
+    shape, channels = camera.cameras[0].sensor.shape, zip(level, camera.responses, strict=True)
+    return np.stack([display.irradiance(shape, *one) for one in channels])
 
 
 def _separable(camera, plane, size, counts, level) -> Separable:

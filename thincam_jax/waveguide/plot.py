@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.imaging.encoding import encode_srgb
+from thincam_jax.imaging.encoding import cie_1931, encode_srgb
 from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.plot.pictures import decibels, draw_beside, draw_columns, labels, show_panel
 from thincam_jax.studies.pictures import diagonal_cells
@@ -35,25 +35,12 @@ COLUMNS_CAPTION = (
     "the exact one."
 )
 
-# Centres, widths below and above (nm) and heights of lobes whose sums are the CIE 1931 matching
-# functions x, y, z to about 1 % (Wyman, Sloan and Shirley, JCGT 2(2), 2013).
-_LOBES = (
-    ((599.8, 37.9, 31.0, 1.056), (442.0, 16.0, 26.7, 0.362), (501.1, 20.4, 26.2, -0.065)),
-    ((568.8, 46.9, 40.5, 0.821), (530.9, 16.3, 31.1, 0.286)),
-    ((437.0, 11.8, 36.0, 1.217), (459.0, 26.0, 13.8, 0.681)),
-)
 _TO_SRGB = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
 
 
 def srgb(wavelength: np.ndarray) -> np.ndarray:
     """Linear sRGB (…, 3) of spectral light, mm, within the gamut, its brightest part 1."""
-    light = np.asarray(wavelength)[..., None] / nm
-    tristimulus = []
-    for lobes in _LOBES:
-        peak, low, high, height = np.array(lobes).T
-        width = np.where(light < peak, low, high)
-        tristimulus.append(np.sum(height * np.exp(-(((light - peak) / width) ** 2) / 2), axis=-1))
-    linear = np.clip(np.stack(tristimulus, axis=-1) @ np.array(_TO_SRGB).T, 0, None)
+    linear = np.clip(cie_1931(np.asarray(wavelength)) @ np.array(_TO_SRGB).T, 0, None)
     return linear / np.maximum(linear.max(axis=-1, keepdims=True), 1e-9)
 
 

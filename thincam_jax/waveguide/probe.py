@@ -169,6 +169,14 @@ class ScreenProbe:
             found = found + view.share * self.seen(rays, way["orders"], view).sum(axis=0)
         return found
 
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the pixels without the middle one."""
+        sensor = self.camera.sensor
+        middle = (np.array(sensor.shape) - 1) / 2
+        rows, columns = np.rint(self.pixels[1:] / float(sensor.pitch) + middle).astype(int).T
+        return rows, columns
+
     def direct(self, views: Sequence[LensView]) -> np.ndarray:
         """Light straight through the plate, (pixel)."""
         found = np.zeros(len(self.pixels) - 1)

@@ -236,17 +236,19 @@ def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: flo
     return total
 
 
+@watched("tracing the screen")
 def monitor_system(
     camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 4, band_samples: int | None = None
-) -> Sparse:
+) -> tuple[Sparse, float]:
     """The matrix from a monitor's cells to the sensor: 1 where a white monitor is brightest.
+
+    And the weight there, mm.
 
     **Errors**: ValueError for a screen that guides no light, or none of the monitor's.
     """
     check_screen(camera)
-    system = system_operator(camera, plane, orders=orders, samples=band_samples)
-    assert isinstance(system, Sparse)
+    system = planes_operator(camera, plane, (orders, band_samples), 1.0)
     brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
     if not brightest > 0:
         raise ValueError("no light from the monitor reaches the sensor")
-    return eqx.tree_at(lambda s: s.values, system, system.values / brightest)
+    return eqx.tree_at(lambda s: s.values, system, system.values / brightest), brightest

@@ -61,8 +61,10 @@ def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_matrix_of_captures_agrees_with_direct_simulation(tmp_path):
-    file = tiny.write(tmp_path, tiny.HADAMARD)
+@pytest.mark.parametrize("light", ["", tiny.DISPLAY_LIGHT])
+def test_a_matrix_of_captures_agrees_with_direct_simulation(light, tmp_path):
+    """With light of a display behind the plate by its shot noise, which is in no calibration."""
+    file = tiny.write(tmp_path, tiny.HADAMARD + light)
     result = call("capture", file, "--out", tmp_path / "a.zarr")
     assert result.exit_code == 0, result.output
     result = call("run", tmp_path / "a.zarr", "--out", tmp_path / "out")

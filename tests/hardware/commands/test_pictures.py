@@ -70,9 +70,32 @@ def test_pictures_come_back(home):
     assert there["TV"]["targets"] == scores["TV"]["targets"]
 
 
+@pytest.mark.thorough
+def test_dark_frames_subtract_the_light_of_a_display(home):
+    """A display behind the plate shines on, in every frame: one without a scene has only it."""
+    scores = {}
+    screen = yaml.safe_load(tiny.HADAMARD + tiny.DISPLAY_LIGHT)["virtual"]
+    for darks in (8, 0):
+        plan = PICTURES["plan"] | {"dark_frames": darks}
+        raw = PICTURES | {"name": f"lit-{darks}", "plan": plan, "virtual": screen}
+        (home / "lit.yaml").write_text(yaml.safe_dump(raw), "utf-8")
+        store, out = f"lit-{darks}.zarr", f"lit-{darks}"
+        for args in (("capture", "lit.yaml"), ("run", store)):
+            result = call(*args, "--out", store if args[0] == "capture" else out)
+            assert result.exit_code == 0, result.output
+        found = json.loads((home / out / "metrics.json").read_text("utf-8"))["methods"]
+        scores[darks] = found["CGM"]["mean_psnr_db"]
+    assert scores[8] > 22 and scores[8] > scores[0] + 5, scores
+
+
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
+        (
+            "virtual.screen.display_light={leak: [[400 nm, 0.1], [700 nm, 0.1]], "
+            "primaries: [{centre: 530 nm, width: 60 nm}], path: lost.tif}",
+            "virtual.screen.display_light.path: lost.tif",
+        ),
         ("matrix=null", "matrix: a plan of kind pictures needs it"),
         ("targets=[]", "targets: a plan of kind pictures needs them"),
         ("plan={kind: scene}", "targets: a plan of kind scene has one; drop the others"),

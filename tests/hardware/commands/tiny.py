@@ -51,6 +51,12 @@ virtual:
     object: {cells: [8, 16], distance: 550 mm, width: 120 mm, y: 27 mm}
     orders: 3
 """
+# A display behind the screen, a third as bright on the sensor as a white monitor.
+DISPLAY_LIGHT = """\
+    display_light:
+      leak: [[400 nm, 0.03], [700 nm, 0.03]]
+      primaries: [{centre: 530 nm, width: 60 nm}]
+"""
 
 
 def write(folder: Path, text: str = METHOD_B) -> Path:

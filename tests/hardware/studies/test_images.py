@@ -108,7 +108,7 @@ def test_variance_of_counts():
 
 def test_a_white_monitor_is_1_where_it_is_brightest():
     study = tiny_screen.study()
-    system = monitor_system(study.camera, study.plane, 2)
+    system, _ = monitor_system(study.camera, study.plane, 2)
     white = system(jnp.ones(study.plane.shape, system.values.dtype))
     assert float(jnp.max(white)) == pytest.approx(1)
     elsewhere = wg.ObjectPlane(study.plane.shape, 550.0, 120.0, (9000.0, 0.0))

@@ -7,6 +7,7 @@ from dataclasses import asdict
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tifffile
 from commands.pages import assert_says_its_result
 from commands.study.tiny import Told
 from PIL import Image
@@ -51,6 +52,42 @@ def test_without_a_calibration_there_is_a_report(tmp_path):
     assert metrics["models"]["right"]["methods"]["CGM"]["mean_psnr_db"] > 25
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "calibration" not in metrics and "Hadamard" not in page
+
+
+LIT = (
+    "calibration=null",
+    "display_light.leak=[[400 nm, 0.1], [700 nm, 0.1]]",
+    "display_light.primaries=[{centre: 530 nm, width: 60 nm}]",
+    "noise={read_noise: 2}",
+    "sensor={shape: [22, 30], pitch: 70.4 um, full_well: 20000, exposure: 0.7}",
+)
+
+
+def test_the_light_of_a_display_in_a_file(tmp_path):
+    study = build_screen(tiny.experiment(tmp_path, *LIT, "display_frames=3"))
+    assert study.display_light is not None and study.display_frames == 3
+    np.testing.assert_allclose(study.display_light.leak, [[400e-6, 0.1], [700e-6, 0.1]])
+    pattern = np.ones((22, 30), np.float32)
+    pattern[:11] = 3
+    tifffile.imwrite(tmp_path / "light.tif", pattern)
+    lit = build_screen(tiny.experiment(tmp_path, *LIT, "display_light.path=light.tif"))
+    np.testing.assert_allclose(
+        np.asarray(lit.background)[[0, -1], 0] / lit.background.mean(), [1.5, 0.5], 1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ("calibration={bits: 10}", "display_light: is of captures without a calibration; drop one"),
+        ("noise={snr_db: 40}", "noise.read_noise: light of a display has shot noise; give"),
+        ("display_light.leak=[[700 nm, 0.1], [400 nm, 0.1]]", "wavelengths that do not rise; sort"),
+        ("display_light.path=lost.tif", "display_light.path: .*lost.tif"),
+    ],
+)
+def test_a_display_that_does_not_fit_is_told(asked, line, tmp_path):
+    with pytest.raises(ConfigError, match=line):
+        build_screen(tiny.experiment(tmp_path, *LIT, asked))
 
 
 @pytest.mark.thorough

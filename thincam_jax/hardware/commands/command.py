@@ -258,7 +258,8 @@ def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     assert virtual is not None  # checked with the file
     if optics is None:
         before = next(iter(config.shown.values())) if config.plan.kind == "scene" else None
-        seen = MonitorOptics(screen_system(config), virtual.electrons, before)
+        system, light = screen_system(config)
+        seen = MonitorOptics(system, virtual.electrons, before, background=light)
     elif config.plan.kind in ("pictures", "alignment"):
         cell = -config.camera.pitch * optics.object.distance / optics.distance  # turned by 180°
         place = virtual.monitor.build().homography(optics.object.distance, display.pitch, cell)

@@ -1,7 +1,7 @@
 """Reconstruction of a store of captures: an image or a system matrix, and a report."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -274,7 +274,9 @@ class _CaptureRun(Run):
         taken, exact = self.taken, None
         captures = taken.calibration
         if taken.seen.camera is not None:
-            exact = screen_system(self.config), taken.seen.camera, taken.seen.pixels
+            system, light = screen_system(self.config)
+            camera = replace(taken.seen.camera, light=light)
+            exact = system, camera, taken.seen.pixels
         found = recover_to(self.folder.path, captures, exact)
         figure = draw_columns(self.config.camera.pitch, found.cells, found.columns)
         self.folder.save_figure("columns", figure)
@@ -376,16 +378,22 @@ def _alignment(config: CaptureConfig) -> Alignment:
     raise ConfigError(f"{config.place_of('alignment')}alignment: {fault}")
 
 
-def screen_system(config: CaptureConfig) -> Sparse:
-    """Matrix from a virtual rig's cells to its sensor: 1 where a white monitor is brightest."""
-    from thincam_jax.waveguide.commands.run import build_cameras, build_plane
+def screen_system(config: CaptureConfig) -> tuple[Sparse, Any]:
+    """Matrix from a virtual rig's cells to its sensor: 1 where a white monitor is brightest.
+
+    And the light (y, x) of a display behind the plate in this unit, 0 without.
+    """
+    from thincam_jax.waveguide.commands.run import build_cameras, build_display, build_plane
     from thincam_jax.waveguide.system import monitor_system
 
     assert config.virtual is not None and config.virtual.screen is not None
     seen = config.virtual.screen
     plane, (camera,) = build_plane(seen), build_cameras(seen)
     try:
-        return monitor_system(camera, plane, seen.orders, seen.band_samples)
+        display = build_display(seen)
+        system, level = monitor_system(camera, plane, seen.orders, seen.band_samples)
+        light = 0.0 if display is None else display.irradiance(camera.sensor.shape, level)
+        return system, light
     except ValueError as error:
-        place = config.place_of("virtual", "screen")
-        raise ConfigError(f"{place}virtual.screen: {error}") from None
+        place = "virtual", "screen", *getattr(error, "place", ())
+        raise ConfigError(f"{config.place_of(*place)}{'.'.join(place)}: {error}") from None

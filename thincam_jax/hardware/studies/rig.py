@@ -58,12 +58,14 @@ class CountingCamera:
 
     - `counts`: counts of a unit of the noise-free image; `electron`: counts of an electron.
     - `read_noise`: in electrons; `offset`: counts that were not subtracted.
+    - `light`: light whose mean was subtracted, (y, x), in the unit of the noise-free image.
     """
 
     counts: float
     electron: float
     read_noise: float
     offset: float = 0.0
+    light: Any = 0.0
 
     def variance(self, counts: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Noise variance of a frame, counts², from its noise-free counts without the offset."""
@@ -383,5 +385,6 @@ def _exact_matrix(
     matrix = camera.counts * system.by_rows()[numbers[pixels].ravel()]
     mean = np.asarray(matrix.sum(axis=1), float).ravel() / 2  # half of the cells are lit
     of_an_entry = 2 if captures.series.display == "complementary" else 4
-    variance = of_an_entry * camera.variance(mean) / captures.series.cell_count
+    light = np.broadcast_to(camera.counts * camera.light, system.out_shape)[pixels].ravel()
+    variance = of_an_entry * camera.variance(mean + light) / captures.series.cell_count
     return matrix, np.sqrt(variance)

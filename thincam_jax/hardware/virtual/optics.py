@@ -330,12 +330,14 @@ class MonitorOptics:
     - `electrons`: per second for each unit of the operator's output.
     - `transmission`: levels over 255 of what stands before the cells, which the monitor lights.
     - `place`: homography from the monitor's pixels to cells, (x, y) from the middle of either.
+    - `background`: light that is always there, (y, x), in the unit of the operator's output.
     """
 
     operator: AbstractOperator
     electrons: float
     transmission: UInt8[np.ndarray, "y x"] | None = None
     place: Float[np.ndarray, "3 3"] | None = None
+    background: Float[np.ndarray, "y x"] | float = 0.0
 
     @functools.cached_property
     def _by_rows(self) -> Any:
@@ -358,7 +360,7 @@ class MonitorOptics:
             image = (self._by_rows @ cells.ravel()).reshape(self.sensor_shape)
         else:
             image = np.asarray(self.operator(jnp.asarray(cells, dtype_of(self.operator))))
-        return self.electrons * image.astype(np.float32)
+        return (self.electrons * (image + self.background)).astype(np.float32)
 
 
 def cells_shown(

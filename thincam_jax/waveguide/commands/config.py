@@ -1,5 +1,6 @@
 """Experiment files of `kind: screen`: a camera behind a glass plate with two holograms."""
 
+import itertools
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -20,11 +21,13 @@ from thincam_jax.commands.sections import (
     check_names,
 )
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
+from thincam_jax.measured.read import read_image
 from thincam_jax.studies.refocus import SceneObject
 from thincam_jax.studies.study import check_noise
+from thincam_jax.waveguide.display import DisplayLight
 from thincam_jax.waveguide.studies.calibration import MEASURED, Calibration
 from thincam_jax.waveguide.studies.mask import ScreenMask, require_mask_fits
-from thincam_jax.waveguide.studies.screen import ScreenModel
+from thincam_jax.waveguide.studies.screen import ScreenModel, require_display_fits
 
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 
@@ -104,6 +107,38 @@ class ScreenMaskConfig(section(ScreenMask, without=("mask",)), MaskConfig):
     gap: Length
 
 
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class DisplayLightConfig(section(DisplayLight, only=("radiance",))):
+    """Light of a display behind the plate, as measured: see `waveguide.display.DisplayLight`.
+
+    - `leak`: rows of a wavelength and the fraction of that light that reaches the sensor.
+    - `primaries`: spectra of its colours. `path`: picture of its light on the sensor; without
+      one it is uniform.
+    """
+
+    leak: Annotated[tuple[tuple[Wavelength, Fraction], ...], Field(min_length=2)]
+    primaries: Annotated[tuple[ResponseConfig, ...], Field(min_length=1)]
+    path: str | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _rises(self):
+        light = [row[0] for row in self.leak]
+        if any(a >= b for a, b in itertools.pairwise(light)):
+            raise FieldError("has wavelengths that do not rise; sort them", "leak")
+        return self
+
+    def build(self, *_: Any, **others: Any) -> DisplayLight:
+        """The light.
+
+        **Errors**: OSError or ValueError for a pattern that is no picture of light.
+        """
+        pattern = None if self.path is None else read_image(self.path).pixels
+        primaries = [one.build() for one in self.primaries]
+        return DisplayLight(self.leak, primaries, self.radiance, pattern)
+
+
 def check_cells(cells: tuple[int, int], *place: str) -> None:
     """Refuse cells that there are no Hadamard patterns of."""
     try:
@@ -133,6 +168,7 @@ class SeeThroughConfig(Section):
 
     - `orders`: number of ghosts; `band_samples`: samples of the colours about each pixel's Bragg
       wavelength, None for that one alone.
+    - `display_light`: that of a display behind the plate which reaches the camera, in every frame.
     """
 
     hologram: HologramConfig
@@ -142,6 +178,7 @@ class SeeThroughConfig(Section):
     object: CellsConfig
     orders: Annotated[int, Field(ge=1, le=16)] = 4
     band_samples: Annotated[int, Field(ge=1, le=64)] | None = None
+    display_light: DisplayLightConfig | None = None
 
     @property
     def optics(self) -> dict[str, Any]:
@@ -154,8 +191,11 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
 
     - `mask`: in place of the lens.
     - `calibration`: measures the camera of the first model, and reconstructs with that matrix too.
+    - `display_frames`: exposures of the display before a dark scene, whose mean is subtracted from
+      each capture; with 0 its light stays.
     """
 
+    with_path: ClassVar[tuple[str, ...]] = ("display_light",)
     kind: Literal["screen"]
     lens: LensConfig | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     mask: ScreenMaskConfig | None = None
@@ -163,6 +203,7 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
     methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
     models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
     calibration: CalibrationConfig | None = None
+    display_frames: Annotated[int, Field(ge=0, le=1000)] = 1
     targets: Annotated[tuple[ScreenTargetConfig, ...], Field(min_length=1)]
     notes: tuple[str, ...] = ()
 
@@ -176,6 +217,11 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
                 raise FieldError("measures a camera with a lens; drop it", "calibration")
             mistakes, colours = [model.mistake for model in self.models], self.hologram.recorded
             require_mask_fits(mistakes, len(colours), self.band_samples, self.screen.tilt)
+        if self.display_light is not None:
+            if self.calibration is not None:
+                raise FieldError("is of captures without a calibration; drop one", "display_light")
+            noise, colours = self.noise.build(), len(self.hologram.recorded)
+            require_display_fits(noise, colours, self.mask is not None)
         if self.calibration is not None:
             if self.hologram.colours is not None and self.calibration.distances:
                 message = "need a hologram of one colour; drop them or hologram.colours"

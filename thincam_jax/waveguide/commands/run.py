@@ -8,6 +8,7 @@ import numpy as np
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.memory import peak_memory, readable
+from thincam_jax._core.quantity import FieldError
 from thincam_jax._core.text import slug
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.pictures import published_figures
@@ -18,6 +19,7 @@ from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.pictures import PUBLISHED, finding
 from thincam_jax.waveguide import plot
 from thincam_jax.waveguide.commands.config import CalibrationConfig, ScreenConfig, SeeThroughConfig
+from thincam_jax.waveguide.display import DisplayLight
 from thincam_jax.waveguide.lens import lens_views
 from thincam_jax.waveguide.studies.calibration import MEASURED, CalibrationRun, CalibrationScores
 from thincam_jax.waveguide.studies.mask import ScreenMask
@@ -42,6 +44,11 @@ def build_screen(config: ScreenConfig) -> ScreenStudy:
     pictures, faults = config.read_each(
         "targets", lambda one: picture(one, cells, channels), "path"
     )
+    display = None
+    try:
+        display = build_display(config)
+    except FieldError as error:
+        faults.append(f"{config.place_of(*error.place)}{'.'.join(map(str, error.place))}: {error}")
     targets = dict(zip([target.name for target in config.targets], pictures, strict=False))
     study = ScreenStudy(
         build_cameras(config),
@@ -58,6 +65,8 @@ def build_screen(config: ScreenConfig) -> ScreenStudy:
         build_mask(config),
         tuple(one.build() for one in config.hologram.responses or ()),
         config,
+        display,
+        config.display_frames,
     )
     try:
         study.check()
@@ -74,6 +83,21 @@ def build_mask(config: ScreenConfig) -> ScreenMask | None:
         return None
     numbers = mask.beta or 0.0, 0.0, mask.distance, config.hologram.recorded[0], mask.width
     return mask.build(mask=build_optics(mask, config.sensor, Exposure(*numbers))[0])
+
+
+def build_display(config: SeeThroughConfig) -> DisplayLight | None:
+    """The display's light, if there is any.
+
+    **Errors**: FieldError for a pattern that cannot be read, or is of other pixels.
+    """
+    if (given := config.display_light) is None:
+        return None
+    try:
+        found = given.build()
+        found.irradiance(config.sensor.shape, 1.0)  # refuses a pattern of other pixels
+        return found
+    except (OSError, ValueError) as error:
+        raise FieldError(str(error), "display_light", "path") from None
 
 
 def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:

@@ -34,6 +34,7 @@ from thincam_jax.studies.pictures import (
 )
 from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.colours import colour_system
+from thincam_jax.waveguide.display import DisplayLight, display_alone, require_display_fits
 from thincam_jax.waveguide.field_of_view import FieldOfView, field_of_view
 from thincam_jax.waveguide.hologram import directions
 from thincam_jax.waveguide.lens import lens_views
@@ -115,6 +116,8 @@ class ScreenStudy:
     - `mask`: in the place of the lens, before a bare sensor; None for the lens.
     - `responses`: responses of a sensor with cross-talk, see `colour_system`; empty: it separates
       colours.
+    - `display_light`: that of a display behind the plate, in all captures, less the mean of so many
+      `display_frames`, exposures of it before a dark scene; with 0 it stays.
     - `config`: the sections of the file that it was read from, if any.
 
     ```python
@@ -155,8 +158,12 @@ class ScreenStudy:
     mask: ScreenMask | None = None
     responses: tuple[wg.ColourBand, ...] = ()
     config: Any = field(default=None, repr=False)
+    display_light: DisplayLight | None = None
+    display_frames: int = 1
 
     def __post_init__(self):
+        if self.display_light is not None:
+            require_display_fits(self.noise, len(self.cameras), self.mask is not None)
         if self.mask is not None:
             mistakes, tilt = [model.mistake for model in self.models], np.asarray(self.camera.tilt)
             require_mask_fits(mistakes, len(self.cameras), self.band_samples, tilt.tolist())
@@ -248,19 +255,38 @@ class ScreenStudy:
         """Every target as the sensor reads it."""
         return self.captured_through(self.systems[0])
 
+    @cached_property
+    def background(self) -> Array:
+        """Irradiance of the display's light on the sensor, 0 without, where images are about 1."""
+        if (light := self.display_light) is None:
+            return jnp.zeros((), dtype_of(self.systems[0]))
+        level = bandwidth(mistaken_rays(self, self.camera, self.models[0].mistake))
+        return jnp.asarray(
+            light.irradiance(self.camera.sensor.shape, level), dtype_of(self.systems[0])
+        )
+
     def captured_through(self, system: AbstractOperator) -> ScreenCaptures:
-        """Every target as the sensor of a camera with that matrix reads it."""
+        """Every target as the sensor of a camera with that matrix reads it.
+
+        Less the display's light, where it is subtracted.
+        """
         images = np.stack(list(self.targets.values()))
         images = np.moveaxis(images, -1, 1) if images.ndim == 4 else images
         images = jnp.asarray(images.reshape(-1, *system.in_shape), dtype_of(system))
-        clean, sensor = system(images), self.camera.sensor
+        clean, sensor = system(images) + self.background, self.camera.sensor
         keys = [jax.random.fold_in(jax.random.key(self.seed), n) for n in range(len(images))]
         read = [
             read_out(sensor, one, noise=self.noise, key=key)
             for one, key in zip(clean, keys, strict=True)
         ]
-        variance = self.noise.variance(clean, electrons_per_unit(sensor, clean))
-        return ScreenCaptures(jnp.stack(read), variance)
+        electrons = electrons_per_unit(sensor, clean)
+        captures, variance = jnp.stack(read), self.noise.variance(clean, electrons)
+        if electrons is not None and self.display_light is not None and self.display_frames > 0:
+            key = jax.random.fold_in(jax.random.key(self.seed), len(images))
+            given = self.background, electrons, (sensor, self.noise, key)
+            alone, added = display_alone(*given, self.display_frames)
+            captures, variance = captures - alone, variance + added
+        return ScreenCaptures(captures, variance)
 
     def run(self, progress: Progress | None = None) -> "ScreenResult":
         """Reconstruct the captures of all targets with every model by every solver."""
@@ -382,7 +408,10 @@ def screen_metrics(result: ScreenResult, rays: "RaySummary") -> dict[str, Any]:
         models[name] = {"mistake": model.mistake, "methods": methods}
     size = (system.matrix if isinstance(system, MaskSystem) else system.values).size
     known = {name: value for name, value in asdict(rays).items() if value is not None}
-    return {"rays": known, "models": models, "entries_of_the_system": int(size)}
+    light = {}
+    if result.study.display_light is not None:
+        light["display_light"] = round(float(result.study.background.mean()), 6)
+    return {"rays": known, "models": models, "entries_of_the_system": int(size)} | light
 
 
 class ScreenRun:
