@@ -96,6 +96,25 @@ def test_cells_of_a_display_leak_and_have_gaps():
         space(levels="phase", contrast=100.0)
 
 
+@pytest.mark.parametrize("split", [2, 8])
+def test_cells_in_parts(split):
+    """The same PSF of whole cells in parts, and that of finer cells where parts differ."""
+    optics, cells = CellOptics(space(), FAR, 0.02), jnp.asarray(drawn(8) * 1.0)
+    in_parts = CellOptics(space(), FAR, 0.02, split=split)
+    whole = jnp.kron(cells, jnp.ones((split, split)))
+    np.testing.assert_allclose(in_parts(whole), optics(cells), atol=1e-9)
+
+
+def test_cells_in_parts_that_differ():
+    """Against as many finer cells, whose window is as wide and whose samples are the same."""
+    rough = jnp.asarray(np.random.default_rng(9).random((2 * COUNT, 2 * COUNT)))
+    in_parts = CellOptics(space(), FAR, CELL / 2, split=2)
+    finer = CellMasks(CELL / 2, 2 * COUNT, distance=4.0, wavelength=5e-4)
+    exact = CellOptics(finer, FAR, CELL / 2, cells=2 * in_parts.cells)
+    assert in_parts.samples == 2 * exact.samples
+    np.testing.assert_allclose(in_parts(rough), exact(rough), atol=1e-9)
+
+
 def test_lone_cells_are_cleared():
     cells = np.zeros((6, 7))
     cells[1, 1] = cells[0, 4] = 1  # alone; the second at the rim

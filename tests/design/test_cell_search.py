@@ -73,7 +73,9 @@ def test_tolerances_are_kept():
             ({"distance": 2.85}, {"distance": 3.15}),
             ({"wavelength": 4.9e-4}, {"wavelength": 5.1e-4}),
         ):
-            moved = [CellOptics(space().replace(**c), 100.0, 0.04, own.cells) for c in changed]
+            moved = [
+                CellOptics(space().replace(**c), 100.0, 0.04, cells=own.cells) for c in changed
+            ]
             each = [error([m(design.masks[0].amplitude)], assumed=[psf]) for m in moved]
             total += sum(each) / 2 - error([psf])
         return error([psf]) + total

@@ -27,7 +27,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
-from thincam_jax._core.precision import as_complex, decimal_value, phasor
+from thincam_jax._core.precision import as_complex, decimal_value, phasor, squared_modulus
 from thincam_jax._core.quantity import choice, quantity, whole
 from thincam_jax.lensless.masks.sampled import SampledMask
 
@@ -135,46 +135,65 @@ class CellOptics(eqx.Module):
 
     - `grid`: samples of the PSFs.
     - `wave`: factor of the spectrum along an axis; `samples`: number of them in a cell.
+    - `split`: parts along a side of each cell, in which amplitudes are given.
     """
 
     grid: Grid
     wave: Complex[Array, " f"]
     cells: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
+    split: int = eqx.field(static=True)
 
     def __init__(
-        self, masks: CellMasks, object_distance: float, pitch: float, cells: int | None = None
+        self,
+        masks: CellMasks,
+        object_distance: float,
+        pitch: float,
+        *,
+        cells: int | None = None,
+        split: int = 1,
     ):
         """`cells`: along a side of the window; by default those that the light can reach."""
         cell, distance, wavelength = (
             float(decimal_value(length))
             for length in (masks.cell, masks.distance, masks.wavelength)
         )
-        count, magnification = masks.count, 1 + distance / object_distance
+        magnification, self.split = 1 + distance / object_distance, split
         self.samples = 3 * max(1, round(cell * magnification / pitch))
         reach = wavelength * distance / cell**2 * self.samples / 2  # of the band, cells
-        self.cells = cells or fast_shape((math.ceil(count + 2 * _MARGIN * reach), 1))[0]
+        self.cells = cells or fast_shape((math.ceil(masks.count + 2 * _MARGIN * reach), 1))[0]
         total = self.cells * self.samples
         refuse_if_too_large("cells of a mask", _BYTES * total**2, "give fewer or larger cells")
-        step = cell / self.samples
+        step, part = cell / self.samples, cell / split
         f = np.fft.fftfreq(total, step)
         path = wavelength * distance / magnification
         # The middle of the samples is that of the mask.
-        ahead = (count - 1) / 2 * cell - (total - 1) / 2 * step
-        open_side = 1.0 if masks.fill_factor is None else float(masks.fill_factor) ** 0.5
-        shape = open_side * np.sinc(open_side * cell * f)
-        wave = shape * np.exp(-1j * np.pi * f * (path * f - 2 * ahead))
-        self.wave = jnp.asarray(wave * self.samples)
+        ahead = (masks.count * split - 1) / 2 * part - (total - 1) / 2 * step
+        side = 1.0 if masks.fill_factor is None else float(masks.fill_factor) ** 0.5
+        shape = side * part / step * np.sinc(side * part * f)
+        self.wave = jnp.asarray(shape * np.exp(-1j * np.pi * f * (path * f - 2 * ahead)))
         self.grid = Grid((total // 3,) * 2, 3 * step * magnification)
 
     def __call__(self, amplitude: Float[Array, "y x"] | Complex[Array, "y x"]):
         """Irradiance over that of the open mask, averaged over the grid's cells."""
+        return self.power(self.spectrum(amplitude))
+
+    def spectrum(self, amplitude: Float[Array, "y x"] | Complex[Array, "y x"]):
+        """Spectrum of the wave on the sensor, of cells in `split` parts along a side."""
         if not jnp.iscomplexobj(amplitude):
             amplitude = as_complex(amplitude)
-        spectrum = jnp.fft.fft2(amplitude, (self.cells,) * 2)
-        spectrum = jnp.tile(spectrum, (self.samples,) * 2)
-        wave = jnp.fft.ifft2(spectrum * self.wave[:, None] * self.wave)
-        power = wave.real**2 + wave.imag**2
+        spectrum = jnp.fft.fft2(amplitude, (self.cells * self.split,) * 2)
+        if self.split == 1:
+            spectrum = jnp.tile(spectrum, (self.samples,) * 2)
+        else:
+            total = self.cells * self.samples
+            places = np.fft.fftfreq(total, 1 / total).astype(int) % len(spectrum)
+            spectrum = spectrum[places][:, places]
+        return spectrum * self.wave[:, None] * self.wave
+
+    def power(self, spectrum: Complex[Array, "v u"]) -> Float[Array, "y x"]:
+        """Irradiance of a wave of this spectrum, averaged over the grid's cells."""
+        power = squared_modulus(jnp.fft.ifft2(spectrum))
         (bins, _), weights = self.grid.shape, jnp.asarray(_BIN, power.dtype)
         parts = power.reshape(bins, 3, bins, 3)
         return jnp.einsum("yaxb,a,b->yx", parts, weights, weights, precision="highest")
