@@ -83,8 +83,9 @@ FINAL = 0.25
 _FALL, _FURTHER, _EXPLAINED = 0.58, 8, 10
 # Weight, iterations and tolerance of the image by total variation from which several planes begin,
 # and fields with as many pixels as the captures: what captures hardly show takes too many data
-# steps. It gains a dark room at 40 dB up to 15 dB. Half of the iterations lose planes 1 dB.
-_TAU, _ITERATIONS, _TOLERANCE = 1.0, 100, 1e-3
+# steps. It gains a dark room at 40 dB up to 15 dB. It is made again where its noise is not the same
+# to such a factor: half of the weight loses up to 3 dB.
+_TAU, _ITERATIONS, _TOLERANCE, _SAME = 1.0, 150, 3e-5, 1.5
 # s, relative to the first, that shows the noise of that image: dark rooms explain any noise with
 # more, and with less what total variation takes from planes at 40 dB counts as noise.
 _FITTED = 0.15
@@ -93,6 +94,7 @@ _STEP_ERROR = 0.05
 # Least μ of the normal equations, in units of the precision's rounding, where ‖A‖ = 1: with less,
 # as of captures with over 45 dB in single precision, they are not solved, and images explode.
 _LEAST_SHIFT = 64
+_Kind = Literal["far", "near", "fitted"]  # images that a run begins with
 _UNIT = 4  # steps of the power method for a unit, which needs to be no closer than that
 
 
@@ -178,14 +180,10 @@ class PlugAndPlay(AbstractIterativeSolver):
         status: Status = "iterations_exhausted"
         runs: list[_Run] = []
         try:
-            slow = not warm and _is_slow(problem)
-            kind = "passing" if slow else "near" if warm else "far"
-            for part, image in zip(parts, images, strict=True):
-                run = _Run(self, part, runs[0].given if runs else None)
-                run.begin(image, kind)
-                runs.append(run)
-            if slow:
-                self._begin_smooth(recording, problem, runs)
+            if not warm and _is_slow(problem):
+                self._begin_smooth(recording, problem, images, runs)
+            else:
+                self._begin(parts, images, "near" if warm else "far", runs)
             for number in range(self.iterations + _FURTHER + 1):
                 for run in runs:
                     run.advance(number)
@@ -220,30 +218,39 @@ class PlugAndPlay(AbstractIterativeSolver):
         solve = functools.partial(self.solve, start=start, callback=callback)
         return reaching_beyond(solve, recording, problem, whole_image, result, self.synthesis)
 
-    def _begin_smooth(self, recording: Recording, problem: InverseProblem, runs: list["_Run"]):
-        """Begin the runs with images by total variation of the noise that was found."""
-        tau = _TAU * max(run.mistake for run in runs)
-        first = AdmmTV(
-            tau,
-            nonnegative=self.nonnegative,
-            synthesis=self.synthesis,
-            iterations=_ITERATIONS,
-            tolerance=_TOLERANCE,
-        )
-        start = None
-        if starts_uniform(recording, problem):
-            # Conjugate gradients find at once what takes ADMM hundreds of iterations. Not in a dark
-            # room, which they fill with light that ADMM takes as long to remove: up to 17 dB less.
-            found = [jnp.maximum(jnp.nan_to_num(run.found), 0) * run.unit for run in runs]
-            start = recording.oriented(jnp.stack(found).reshape(problem.image_shape))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
-            begun = first.solve(pinned(recording), start=start)
-        image = first_image(problem, recording.oriented(begun.image), uniform=True)
-        for run, own in zip(runs, _split(image, [run.problem for run in runs]), strict=True):
-            run.begin(own, "fitted")
-        if begun.status == "interrupted":
-            raise KeyboardInterrupt
+    def _begin(self, parts: list[InverseProblem], images: list[Image], kind: _Kind, runs: list):
+        """Begin the runs of parts, one after the other."""
+        runs.clear()
+        for part, image in zip(parts, images, strict=True):
+            run = _Run(self, part, runs[0].given if runs else None)
+            run.begin(image, kind)
+            runs.append(run)
+
+    def _begin_smooth(
+        self, recording: Recording, problem: InverseProblem, images: list[Image], runs: list["_Run"]
+    ):
+        """Begin the runs with images by total variation, once more if the noise was another."""
+        parts, mistake, start = _parts(problem), 1.0, None
+        for _ in range(2):
+            first = AdmmTV(
+                _TAU * mistake,
+                nonnegative=self.nonnegative,
+                synthesis=self.synthesis,
+                iterations=_ITERATIONS,
+                tolerance=_TOLERANCE,
+            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
+                begun = first.solve(pinned(recording), start=start)
+            start = begun.image
+            image = first_image(problem, recording.oriented(start), uniform=True)
+            images[:] = _split(image, parts)
+            self._begin(parts, images, "fitted", runs)
+            if begun.status == "interrupted":
+                raise KeyboardInterrupt
+            before, mistake = mistake, max(run.mistake for run in runs)
+            if max(mistake / before, before / mistake) < _SAME:
+                return
 
 
 class _Run:
@@ -257,11 +264,10 @@ class _Run:
         self.given = _normal(scaled.problem, jnp.ones_like(self.given_precision), like)
         self.misfit = self.gap = self.change = math.nan
 
-    def begin(self, image: Image, kind: Literal["far", "near", "fitted", "passing"]) -> None:
+    def begin(self, image: Image, kind: _Kind) -> None:
         """The first data step, and the noise, from an image far from the one sought, or near it.
 
-        Of one that is "fitted" to the captures, a data step with less s shows the noise. A
-        "passing" beginning finds no more than that for another one.
+        Of one that is "fitted" to the captures, a data step with less s shows the noise.
         """
         warm = kind in ("near", "fitted")
         self._take(self.given)
@@ -278,8 +284,7 @@ class _Run:
         self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]))
         noise = self._noise()
         self.mistake = float(noise.mistake)
-        weighted = kind != "passing" and bool(noise.grows)
-        if weighted:
+        if bool(noise.grows):
             self._weigh(noise.variances)
             self._step(self.s)
             noise = self._noise()
