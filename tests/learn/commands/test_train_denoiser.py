@@ -49,6 +49,8 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
         on.exit_code == 0
         and json.loads((tmp_path / "c/training.json").read_text("utf-8"))["steps"] == 4
     )
+    images = network_card(tmp_path / "c" / NETWORK).images
+    assert images["trained on, before"] == card.images["trained on"] == images["trained on"]
     # A network of the same name with other content.
     kept = (out / NETWORK).read_bytes()
     (out / NETWORK).write_bytes((tmp_path / "c" / NETWORK).read_bytes())

@@ -74,6 +74,10 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     more = "--set", "pairs={path: pairs, judged: 1}", "--set", f"start={out / NETWORK}"
     tuned = call(file, "--out", tmp_path / "b", *more)
     assert tuned.exit_code == 0, tuned.output
+    # It carries the pictures of its start, and their licences.
+    uses = training_record(tmp_path / "b" / NETWORK)["images"]
+    assert uses["trained on, before"] == record["images"]["trained on"]
+    assert [entry["name"] for entry in uses["trained on"]] == ["0", "1"]
     other = line(call(file, "--out", tmp_path / "c", *more, "--set", "network.widths=[6]"))
     assert "give these in the section network" in other
 

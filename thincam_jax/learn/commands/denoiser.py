@@ -1,5 +1,6 @@
 """Experiment files of `kind: denoiser`: pictures, a network and its training in a folder."""
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,9 +16,16 @@ from thincam_jax.learn.commands.training import (
     InFolder,
     LearningConfig,
     SourceConfig,
+    images_before,
 )
 from thincam_jax.learn.denoiser import pictures
-from thincam_jax.learn.denoiser.network import Denoiser, DenoiserOptions, DenoisingUNet, create
+from thincam_jax.learn.denoiser.network import (
+    Denoiser,
+    DenoiserOptions,
+    DenoisingUNet,
+    create,
+    network_card,
+)
 from thincam_jax.learn.denoiser.pictures import Pictures, united
 from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
 from thincam_jax.learn.plot import draw_losses
@@ -61,6 +69,8 @@ def run_denoiser(config: DenoiserConfig, place: InFolder) -> Ended:
     """Train a denoiser; writes training.json last. **Errors**: as of `InFolder`."""
     place.check(config)
     folder, network, lessons = place.folder, build_network(config), build_lessons(config)
+    known = images_before(config, lambda path: network_card(path).images)
+    lessons = replace(lessons, before=known)
     trained = place.train(config, train_denoiser, network, lessons)
     state = trained.state
     result = {

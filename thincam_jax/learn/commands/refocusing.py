@@ -4,11 +4,12 @@ import functools
 import operator
 import time
 from dataclasses import asdict
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import Field
 
+from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.mask import APERTURE, ApertureConfig
 from thincam_jax.commands.report import Page, Part, Picture, pixels_of
@@ -37,6 +38,9 @@ from thincam_jax.plot.refocus import animate_sweep, draw_sweep
 from thincam_jax.studies.refocus import FocusRange
 
 _SWEEP = "One capture, focused on the distance above each; one grey scale for all."
+_PAIRS = (
+    "pictures on a monitor have no depth, which this network learns; give pairs to 'kind: trained'"
+)
 _SCENES = (
     "Where it is hatched, the network itself takes its distance to be wrong more often than right."
 )
@@ -89,6 +93,18 @@ class LearnedConfig(LenslessConfig, LearningConfig):
     network: NetworkConfig = NetworkConfig()
     training: RefocusTrainingConfig = RefocusTrainingConfig()
     notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _without_pairs(cls, given: Any):
+        """The file; docs/decisions/pairs_of_a_monitor.md says why it takes no pairs."""
+        entries = given.get("sources") if isinstance(given, dict) else ()
+        for number, one in enumerate(entries if isinstance(entries, list | tuple) else ()):
+            if isinstance(one, dict) and one.get("kind") == "pairs":
+                raise FieldError(_PAIRS, "sources", number, "kind")
+        if entries == "pairs":
+            raise FieldError(_PAIRS, "sources")
+        return given
 
 
 def run_training(config: LearnedConfig, place: InFolder) -> Ended:

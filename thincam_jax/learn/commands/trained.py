@@ -3,6 +3,7 @@
 import functools
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -21,13 +22,19 @@ from thincam_jax.commands.schema import Section, section
 from thincam_jax.learn import trained_lessons
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.commands.denoiser import PicturesConfig, read_pictures
-from thincam_jax.learn.commands.training import TRAINING, Ended, InFolder, LearningConfig
+from thincam_jax.learn.commands.training import (
+    TRAINING,
+    Ended,
+    InFolder,
+    LearningConfig,
+    images_before,
+)
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.plot import draw_losses
 from thincam_jax.learn.refocusing.learned import finite
-from thincam_jax.learn.refocusing.sources import as_json
+from thincam_jax.learn.refocusing.sources import as_json, from_json
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction
+from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction, training_record
 from thincam_jax.learn.trained_lessons import CameraLessons, PairLessons
 from thincam_jax.learn.trained_training import (
     NETWORK,
@@ -115,6 +122,8 @@ def run_trained(config: TrainedConfig, place: InFolder) -> Ended:
     place.check(config)
     folder, lessons = place.folder, build_lessons(config)
     untrained = build_untrained(config, lessons)
+    known = images_before(config, lambda path: from_json(training_record(path).get("images", {})))
+    lessons = replace(lessons, images=lessons.images | known)
     done = place.train(config, train_reconstruction, untrained, lessons)
     state, rows = done.state, gains(done.model, lessons, config.seed)
     before, after = (float(np.mean(part)) for part in zip(*rows, strict=True))

@@ -14,6 +14,7 @@ from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sections import ExperimentConfig, Name, check_keys, check_names
 from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.refocusing.sources import Entry
 from thincam_jax.learn.training import NETWORK, Trained, TrainingOptions, TrainingProgress
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -72,6 +73,20 @@ class TrainingFolder(RunFolder):
 
     kind, folders, result = "training", ("figures",), "training.json"
     others = (NETWORK,)
+
+
+def images_before(
+    config: Any, images_of: Callable[[Any], dict[str, tuple[Entry, ...]]]
+) -> dict[str, tuple[Entry, ...]]:
+    """Entries of the pictures of the network that a training starts from, by their use before.
+
+    **Errors**: ConfigError for a file that does not say them.
+    """
+    try:
+        found = {} if config.start is None else images_of(config.start)
+    except (CheckpointError, TypeError) as error:
+        raise ConfigError(f"{config.place_of('start')}start: {error}") from None
+    return {f"{use}, before": entries for use, entries in found.items()}
 
 
 @dataclass(frozen=True)

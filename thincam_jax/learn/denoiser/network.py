@@ -24,7 +24,7 @@ from thincam_jax.learn.checkpoint import (
     read_weights,
     write_arrays,
 )
-from thincam_jax.learn.refocusing.sources import Entry
+from thincam_jax.learn.refocusing.sources import Entry, from_json
 from thincam_jax.learn.refocusing.unet import blocks_to_channels, channels_to_blocks, convolved
 
 _IMAGES = 5  # of the input: the four pixels of a block, and the noise level
@@ -279,8 +279,7 @@ def network_card(path: str | os.PathLike[str] = SHIPPED) -> NetworkCard:
     description = network_description(path, _KIND)
     training = description["training"]
     try:
-        uses = training.get("images", {}).items()
-        images = {use: tuple(Entry(**one) for one in entries) for use, entries in uses}
+        images = from_json(training.get("images", {}))
         numbers = tuple(training.get("scores", ())), float(training.get("cpu_seconds", 0.0))
         return NetworkCard(_options(description), images, *numbers)
     except Exception as error:  # whatever another's card holds

@@ -48,6 +48,7 @@ class DenoisingLessons:
     - `batch`: crops of a step; `crop`: pixels of their sides; `judged`: batches of a check.
     - `cameras`: number of drawn cameras, behind which the network learns inside the steps of
       `PlugAndPlay`, too; 0: none.
+    - `before`: entries of the pictures of the network that training starts from, by their use.
     """
 
     pictures: Pictures
@@ -56,6 +57,7 @@ class DenoisingLessons:
     crop: Annotated[int, whole(1, TILE)] = 64
     judged: Annotated[int, whole(1, 1000)] = 16
     cameras: Annotated[int, whole(0, 1000)] = 0
+    before: dict[str, tuple[Entry, ...]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         check_fields(self)
@@ -81,7 +83,8 @@ class DenoisingLessons:
     def images(self) -> dict[str, tuple[Entry, ...]]:
         """Entries of all pictures by their use."""
         uses = {"trained on": self.pictures, "judged on": self.held_out}
-        return {use: one.manifest for use, one in uses.items() if one is not None}
+        own = {use: one.manifest for use, one in uses.items() if one is not None}
+        return own | self.before
 
 
 def train_denoiser(

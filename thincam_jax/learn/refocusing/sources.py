@@ -94,6 +94,11 @@ def as_json(images: dict[str, tuple[Entry, ...]]) -> dict[str, list[dict[str, st
     return {use: [asdict(entry) for entry in entries] for use, entries in images.items()}
 
 
+def from_json(images: dict[str, list[dict[str, str]]]) -> dict[str, tuple[Entry, ...]]:
+    """Entries of `as_json`."""
+    return {use: tuple(Entry(**one) for one in entries) for use, entries in images.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Source:
     """Images of equal size to draw scenes from, and where they are from.
