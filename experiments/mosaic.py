@@ -25,21 +25,23 @@ from thincam_jax.studies import Method, Study, Target
 from thincam_jax.studies.evaluate import evaluate, expose, field_shape, reconstructor, stacked
 from thincam_jax.units import nm, um
 
-# "half": half the sensor, with total variation; "small": a quarter of it, in a minute.
+# "whole": all of the thesis' pixels, one noise; "half": half the sensor, with total variation;
+# "small": a quarter of it, in a minute.
 SIZE = os.environ.get("THINCAM_SIZE", "full")
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "mosaic"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
 # The sensor of the thesis, 5.632 mm, with pixels of twice its pitch; "small" is a quarter as wide,
 # with zones as fine. Masks of half the width and twice the β have the same band.
-count, seeds, noises = {
-    "full": (512, 3, (30, 40)),
-    "half": (256, 1, (40,)),
-    "small": (128, 1, (40,)),
+count, pitch, seeds, noises = {
+    "whole": (1024, 5.5 * um, 1, (40,)),
+    "full": (512, 11 * um, 3, (30, 40)),
+    "half": (256, 11 * um, 1, (40,)),
+    "small": (128, 11 * um, 1, (40,)),
 }[SIZE]
-part = 512 / count
+part = round(5.632 / (count * pitch))
 light, distance, place = 500 * nm, 6.5, (250.0, 90.0 / part)
-sensor = tc.Sensor((count, count), 11 * um)
+sensor = tc.Sensor((count, count), pitch)
 beta, small, wall = 50.0 * part, 2.7 / part, 0.1 / part
 phases = [[0.0, math.pi / 2], [math.pi, 3 * math.pi / 2]]
 
@@ -71,7 +73,7 @@ def direct(row):
     b, x = math.pi * scale / (light * distance), np.asarray(sensor.grid.x, float) / scale
     y = float(sensor.grid.y[row]) / scale
     nodes = small * ((np.arange(40_000) + 0.5) / 40_000 - 0.5)
-    field, cell = 0.0, count * 11 * um / 2
+    field, cell = 0.0, count * pitch / 2
     for (down, across), phase in zip(
         [(v, u) for v in (-0.5, 0.5) for u in (-0.5, 0.5)], np.ravel(phases), strict=True
     ):
@@ -92,7 +94,7 @@ from_sum = np.linalg.norm(line - summed) / np.linalg.norm(summed)
 print(f"PSF without walls, from the direct sum: {from_sum:.1e}")
 
 figure, axes = plt.subplots(1, 3, figsize=(12.5, 4.0), layout="constrained")
-half = count * 11 * um / 2
+half = count * pitch / 2
 for ax, (name, frame) in zip(axes, frames.items(), strict=False):
     picture = ax.imshow(frame, cmap="gray", extent=(-half, half, half, -half))
     ax.set(title=f"PSF, {name}", xlabel="x on the sensor (mm)", ylabel="y on the sensor (mm)")
@@ -112,10 +114,8 @@ figure.savefig(FIGURES / "psf.png", dpi=110)
 # A part at c sees a point at t displaced by (d/t)·c. Its PSF holds this, so that reconstructions of
 # all parts agree. The same captures, as if all parts stood in one place:
 
-steps = (40.0, 80.0, 160.0, 320.0) if SIZE == "full" else (20.0, 80.0)
-photographs = {"full": ("camera", "coins", "rocket"), "half": ("camera", "coins")}.get(
-    SIZE, ("camera",)
-)
+steps = (40.0, 80.0, 160.0, 320.0) if part == 1 else (20.0, 80.0)
+photographs = ("camera", "coins", "rocket")[: {1: 3, 2: 2}.get(part, 1)]
 
 
 def decibels(recording, scene):
@@ -144,7 +144,7 @@ for step in steps:
     parallax[step] = np.array(rows)
     moved = 2 * distance / step * float(abs(walled.cameras[0].place[0]))
     print(
-        f"t = {step:g} mm: parts differ by {moved / (11 * um):.1f} pixels; "
+        f"t = {step:g} mm: parts differ by {moved / pitch:.1f} pixels; "
         f"{parallax[step].mean(axis=0).round(1)} dB registered and not, "
         f"spread {parallax[step].std(axis=0).round(1)}"
     )
@@ -155,10 +155,10 @@ for step in steps:
 #
 # All have the same total time: an exposure of 4, or four of 1. The electrons are those at which one
 # capture by a mask of the sensor's width has the SNR given, in the whole time. The scene moves by
-# so many pixels of the sensor in it. Method A′ is two β at four phases: eight captures of a half,
+# so many pixels of 11 µm in it. Method A′ is two β at four phases: eight captures of a half,
 # or eight masks. Halves of the width cost half of the resolution, or take twice the β.
 
-ways = {"full": (0, 4, 8, 16), "half": (0, 4, 8, 16, 32), "small": (0, 8)}[SIZE]
+ways = {1: (0, 4, 8, 16), 2: (0, 4, 8, 16, 32), 4: (0, 8)}[part]
 shape = {"wavelength": light, "width": 5.632 / part}
 parts_of = {"wavelength": light, "width": small, "relative_time": 4}
 four, eight = Layout(2, 2, wall), Layout(2, 4, wall)
@@ -184,7 +184,7 @@ targets = [
 ]
 print("captures:", {method.name: len(method.exposures) for method in methods})
 tv = tc.AdmmTV(0.3, iterations=60)
-if SIZE != "full":
+if part > 1:
     methods = methods[:2]
 if SIZE == "half":
     short = tc.Exposures(beta, distance, **parts_of | {"relative_time": 1}).fringe_scanned()
@@ -218,7 +218,7 @@ studies = {
 
 
 def moving(method, pixels):
-    """The method's exposures of a scene that goes so many pixels of the sensor in all."""
+    """The exposures of a scene that goes so many pixels of 11 µm in all."""
     speed = pixels * 11 * um * 250 / distance / 4
     return method.exposures.of_moving(speed) if speed else method.exposures
 
@@ -380,7 +380,7 @@ def by_scipy(numbers):
 
 bounds = [(0.6, 1.1), (0.6, 1.1), (0.0, 2.0), (0.0, 2.0)]
 best = scipy.optimize.minimize(
-    by_scipy, begin, jac=True, bounds=bounds, options={"maxiter": 25 if SIZE == "full" else 3}
+    by_scipy, begin, jac=True, bounds=bounds, options={"maxiter": 25 if part == 1 else 3}
 )
 print(
     f"error {cost(begin):.4f} -> {best.fun:.4f}: β {beta * best.x[:2].round(3)}, "
