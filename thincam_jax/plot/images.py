@@ -12,7 +12,7 @@ from thincam_jax._core.checks import Number, pixel_pitch
 from thincam_jax.imaging.encoding import eight_bit, pictures
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.sensor import Sensor
-from thincam_jax.plot.frame import Figure, new_figure, sheet, show_image
+from thincam_jax.plot.frame import Figure, drawing, new_figure, sheet, show_image
 
 if TYPE_CHECKING:
     from thincam_jax.reconstruction.result import Reconstruction
@@ -101,4 +101,12 @@ def draw_result(result: "Reconstruction") -> matplotlib.figure.Figure:
         ax.set_axis_on()
     if len(every) > _MOST:
         figure.suptitle(f"the first {_MOST} of {len(every)} images")
+    return figure
+
+
+def draw_widths(width: np.ndarray) -> matplotlib.figure.Figure:
+    """Widths of intervals about the pixels of an image (channel, y, x), colours averaged."""
+    figure, ax = drawing((5, 5 * width.shape[-2] / width.shape[-1] + 0.4))
+    shown = show_image(ax, width.mean(axis=0), None, vmin=0)
+    figure.colorbar(shown, ax=ax, label="width of the intervals")
     return figure

@@ -15,6 +15,7 @@ from commands.test_cli import one_line, runner
 from helpers import shared_data
 from thincam_jax.commands import cli
 from thincam_jax.commands.reconstruct import run
+from thincam_jax.studies.intervals import Intervals
 
 
 def call(paths, out, *more, psf="psf", capture="capture"):
@@ -49,6 +50,47 @@ def record_of(path):
 @pytest.fixture
 def grey(tmp_path):
     return simulated.grey_files(tmp_path)
+
+
+def intervals_of(folder, channels=1):
+    """A file of intervals: 0.2 of each image's range and 0.4 of its contrast about it."""
+    lines = (1.0,) * channels, (0.0,) * channels
+    made = Intervals(0.9, 20, "own", *lines, (0.1, 0.0, 0.2), 2.0)
+    path = folder / "ridge.json"
+    path.write_text(made.as_json(), "utf-8")
+    return made, path
+
+
+def test_intervals_are_written_and_drawn(grey, tmp_path):
+    out, (made, path) = tmp_path / "image.png", intervals_of(tmp_path)
+    more = ("--bits", 12, "--background", grey["dark"], "--method", "ridge", "--intervals", path)
+    result = call(grey, out, *more)
+    assert result.exit_code == 0, result.output
+    image, lower, upper = (np.load(tmp_path / f"image{n}.npy") for n in ("", "-lower", "-upper"))
+    expected = made.of(image.reshape(1, *image.shape[-2:]).astype(float))
+    for found, end in zip((lower, upper), expected, strict=True):
+        np.testing.assert_allclose(found.ravel(), end.ravel(), rtol=1e-5, atol=1e-6)
+    width = upper - lower
+    assert width.min() > 0 and width.max() > 1.2 * width.min()
+    with PIL.Image.open(tmp_path / "image-width.png") as drawn:
+        assert np.asarray(drawn).std() > 1
+    record = record_of(out)["intervals"]
+    assert record["probability"] == 0.9 and record["pictures"] == 20
+    assert record["mean_width"] == pytest.approx(float(width.mean()), rel=1e-4)
+
+
+def test_intervals_that_do_not_fit_are_told(grey, tmp_path):
+    out, (_, path) = tmp_path / "image.png", intervals_of(tmp_path)
+    full = call(grey, out, "--intervals", path, "--field", "full")
+    assert "leave out --distances, --network and --field" in one_line(full)
+    missing = one_line(call(grey, out, "--intervals", tmp_path / "no.json"))
+    assert "no.json: is missing; give intervals/METHOD.json" in missing
+    path.write_text("{}", "utf-8")
+    assert "holds no intervals; give a file" in one_line(call(grey, out, "--intervals", path))
+    _, path = intervals_of(tmp_path, channels=3)
+    line = one_line(call(grey, out, "--bits", 12, "--background", 0, "--intervals", path))
+    assert "has 1 channels, and the intervals are of images of 3" in line
+    assert not out.exists()
 
 
 @pytest.mark.thorough

@@ -93,10 +93,7 @@ def test_the_file_makes_the_camera(file):
         ("sources.0.use=judge", "none of them is of use 'train'"),
         ("sources.0.path=there", "kind drawn takes no 'path'"),
         ("sources.0.kind=folder", "kind folder needs 'path'"),
-        (
-            "sources.0.kind=pairs",
-            r"sources\[0\].kind: pictures on a monitor have no depth",
-        ),
+        ("sources.0.kind=pairs", r"sources\[0\].kind: pictures on a monitor have no depth"),
         ("sources=pairs", "sources: pictures on a monitor have no depth"),
     ],
 )

@@ -201,6 +201,12 @@ def reconstruct(
         Literal["npy", "tif", "none"],
         Option(help="Format of the linear image that is written beside a PNG."),
     ] = "npy",
+    intervals: Annotated[
+        Path | None,
+        Option(
+            help="Intervals of the method by 'thincam evaluate' (intervals/METHOD.json), to draw."
+        ),
+    ] = None,
     gamma: Annotated[float, Option(help="Gamma of the PNG.")] = 2.2,
     white_balance: Annotated[
         str | None, Option(help="White balance of the PNG: grey-world, or gains such as 1.8,1,1.4.")
@@ -232,7 +238,9 @@ def reconstruct(
         name, settings = options.read_method(method), vars(solver)
         recipe = options.Recipe(name, field=field, flip=flip, focusing=focusing, **settings)
         balance, unsure = options.read_white_balance(white_balance), focusing is not None
-        output = options.Output(out, linear, gamma, balance, unsure)
+        one = not (distances or network)
+        ends = options.read_intervals(intervals, one, field)
+        output = options.Output(out, linear, gamma, balance, unsure, ends)
         jobs = plan_jobs(capture[0], sources, output, tuple(capture[1:]))
         end = run_with_bar(jobs, sources, recipe, output)
     if end:

@@ -184,8 +184,12 @@ def _jobs_of(capture: Path, path: Path, sources: Sources, output: Output) -> lis
     """One for each distance, and one of all of them; or the only one."""
     images = _images(path, output)
     if not sources.distances:
-        unsure = path.with_name(f"{path.stem}-unsure.png")
-        return [Job(capture, images, beside=(unsure,) if output.unsure else ())]
+        linear = next((p.suffix for p in images if p.suffix.lower() in LINEAR), ".npy")
+        names = ["-unsure.png"] if output.unsure else []
+        if output.intervals is not None:
+            names += [f"-lower{linear}", f"-upper{linear}", "-width.png"]
+        beside = tuple(path.with_name(f"{path.stem}{name}") for name in names)
+        return [Job(capture, images, beside=beside)]
     jobs = []
     for focus, distance in enumerate(sources.distances):
         name = path.with_name(f"{path.stem}-{distance:g}mm{path.suffix}")

@@ -20,6 +20,7 @@ from thincam_jax.reconstruction.depth.refocus import increasing
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.methods import SOLVERS, AdmmTV, Fista
 from thincam_jax.reconstruction.ridge import Ridge
+from thincam_jax.studies.intervals import Intervals
 from thincam_jax.studies.prepared import computed_psf
 from thincam_jax.units import parse_quantity
 
@@ -230,6 +231,8 @@ class Output:
     - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
     - `gamma`, `white_balance`: encoding of the PNG; see `measured.to_display`.
     - `unsure`: also NAME-unsure.png, a learned image with what is not sure in red.
+    - `intervals`: calibrated by 'thincam evaluate'; also NAME-lower and NAME-upper, linear, their
+      ends at each pixel, and NAME-width.png, a map of their widths.
     """
 
     path: Path
@@ -237,6 +240,26 @@ class Output:
     gamma: float | int = 2.2
     white_balance: WhiteBalance = None
     unsure: bool = False
+    intervals: Intervals | None = None
+
+
+def read_intervals(path: Path | None, one_method: bool, field: str) -> Intervals | None:
+    """Intervals of a file of 'thincam evaluate'.
+
+    **Errors**: MeasurementError where there are none, and for images that they do not hold for.
+    """
+    if path is None:
+        return None
+    if not one_method or field != "sensor":
+        text = "are of one PSF, a --method and the sensor's field"
+        raise MeasurementError(f"--intervals {text}; leave out --distances, --network and --field")
+    try:
+        return Intervals.load(path)
+    except FileNotFoundError:
+        text = "is missing; give intervals/METHOD.json of a run of 'thincam evaluate'"
+        raise MeasurementError(f"--intervals {path}: {text}") from None
+    except (OSError, ValueError) as error:
+        raise MeasurementError(f"--intervals {error}") from None
 
 
 def read_background(text: str | None) -> Background:

@@ -155,9 +155,25 @@ def _run_job(
         "display": shown if job.is_shown else None,
         "environment": environment(time.perf_counter() - began),
     }
-    beside = dict.fromkeys(job.beside, made.marked) if made.marked else None
+    beside = {job.beside[0]: made.marked} if made.marked else {}
+    if (intervals := output.intervals) is not None:
+        beside, width = _ends(job, intervals.of(np.asarray(image, float)))
+        known = {"probability": intervals.probability, "pictures": intervals.pictures}
+        record["intervals"] = {**known, "levels": intervals.levels, "mean_width": width}
     write_job(job, image, record, output, beside)
     return replace(made, record=record, image=image, line=f"{job.images[0]}: {made.line}")
+
+
+def _ends(job: Job, ends: tuple[np.ndarray, np.ndarray]) -> tuple[dict[Path, bytes], float]:
+    """Files of the ends of intervals and of a map of their widths, and the mean width."""
+    from thincam_jax.plot.frame import as_png
+    from thincam_jax.plot.images import draw_widths
+
+    *linear, drawn = job.beside
+    pairs = zip(linear, ends, strict=True)
+    files = {p: linear_bytes(end.astype(np.float32), p.suffix.lower()) for p, end in pairs}
+    width = ends[1] - ends[0]
+    return files | {drawn: as_png(draw_widths(width))}, float(width.mean())
 
 
 def _join(job: Job, images: list[np.ndarray], rig: Inputs, output: Output) -> Finished:
@@ -325,6 +341,12 @@ def _check_channels(job: Job, ready: Prepared, recipe: Recipe, output: Output) -
         raise measured.MeasurementError(
             f"{job.capture}: has {channels} channels and coupling 'opponent' is for 3; "
             "choose 'joint' or 'none'"
+        )
+    known = output.intervals
+    if known is not None and len(known.gain) != channels:
+        raise measured.MeasurementError(
+            f"{job.capture}: has {channels} channels, and the intervals are of images of "
+            f"{len(known.gain)}; give those of such captures"
         )
     if job.is_shown:
         if channels not in (1, 3):
