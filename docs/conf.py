@@ -290,6 +290,7 @@ CARDS = {
     "compare_masks": ("masks.png", 185, 20, 147),
     "data_set": ("data-set.png", 208, 26, 130),
     "denoiser": ("denoiser.png", 0, 0, 418),
+    "designs_as_made": ("as-made-cells.png", 68, 36, 234),
     "field_design": ("field-design.png", 770, 28, 299),
     "field_of_view": ("field-of-view.png", 700, 727, 104),
     "first_image": ("first-image.png", 969, 31, 273),

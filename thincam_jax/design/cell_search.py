@@ -306,8 +306,12 @@ class _Problem(eqx.Module):
     def flipped(self, numbers: Array, settings: CellSettings) -> tuple[Array, float, int]:
         """Numbers as they are made, their error, and how many slopes were taken.
 
-        The cells that promise most are flipped together; where that fails, half as many.
+        The cells that promise most are flipped together; where that fails, half as many. Without
+        lone cells it begins where it ends with them.
         """
+        before = 0
+        if not settings.lone_cells:
+            numbers, _, before = self.flipped(numbers, replace(settings, lone_cells=True))
 
         def made(parts: Array) -> Array:
             if settings.lone_cells:
@@ -324,7 +328,7 @@ class _Problem(eqx.Module):
             promise = (slope * (1 - 2 * parts)).ravel()
             several = min(several, int(jnp.sum(promise < 0)))
             if several == 0:
-                return parts - 0.5, math.exp(float(value)), taken + 1
+                return parts - 0.5, math.exp(float(value)), before + taken + 1
             chosen = jnp.argsort(promise)[:several]
             other = parts.ravel().at[chosen].set(1 - parts.ravel()[chosen])
             other = made(other.reshape(parts.shape))
@@ -333,7 +337,7 @@ class _Problem(eqx.Module):
                 parts, value, slope = other, new, new_slope
             else:
                 several //= 2
-        return parts - 0.5, math.exp(float(value)), settings.flips + 1
+        return parts - 0.5, math.exp(float(value)), before + settings.flips + 1
 
 
 def _moved(
