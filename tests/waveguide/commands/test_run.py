@@ -76,6 +76,16 @@ def test_the_light_of_a_display_in_a_file(tmp_path):
     )
 
 
+@pytest.mark.thorough
+def test_a_page_says_the_light_of_a_display(tmp_path):
+    given = (*LIT, "models=[{name: right}]", "methods=[{name: CGM, kind: ridge}]")
+    run_screen(build_screen(tiny.experiment(tmp_path, *given)), RunFolder(tmp_path / "out"), Told())
+    light = stored(tmp_path / "out")["display_light"]
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert light > 0.5 and f"adds {light:.3g} of a white object" in page
+    assert "exposures of it, subtracted: 1." in page
+
+
 @pytest.mark.parametrize(
     ("asked", "line"),
     [

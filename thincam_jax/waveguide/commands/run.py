@@ -182,6 +182,7 @@ def page(
             "field.png", "Wavelengths, ghost shifts or shadows over the field", captions["field"]
         ),
         str(rays),
+        _display(result.study),
     )
     scored = f"PSNR after a least-squares gain and offset, by {last}."
     errors = (
@@ -201,6 +202,16 @@ def page(
         Part("Notes", config.notes),
     )
     return Page(lead, parts, result=finding(result.right.methods))
+
+
+def _display(study: ScreenStudy) -> str:
+    """The light of a display behind the plate in a sentence; empty without one."""
+    if study.display_light is None:
+        return ""
+    light = f"adds {float(study.background.mean()):.3g} of a white object's light"
+    return (
+        f"A display behind the plate {light}; exposures of it, subtracted: {study.display_frames}."
+    )
 
 
 def _calibration(
