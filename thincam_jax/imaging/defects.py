@@ -1,6 +1,8 @@
 """Values that measure no light: a plateau where light is cut off, defective, unknown pixels."""
 
 import functools
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -96,50 +98,88 @@ def stuck(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray
     return found
 
 
+@dataclass(frozen=True)
+class _Block:
+    """Connected pixels at one value; `edge`: differences of the pixels around from it."""
+
+    number: int
+    size: int
+    is_rectangle: bool
+    edge: np.ndarray
+
+    def is_sharp(self, least: float, usual: float) -> bool:
+        """Steps at all its edges are twice those between neighbours elsewhere."""
+        return bool(self.edge.min() > max(2 * usual, least))
+
+    def is_whole(self, spread: float) -> bool:
+        """A rectangle with an eighth of the plane's range at all its edges."""
+        return self.is_rectangle and bool(self.edge.min() > spread / 8)
+
+    def is_deep(self, least: float) -> bool:
+        """Large, amid light that is even: noise would lift some pixels of a shadow."""
+        rise = max(least, float(np.median(self.edge)) / 2)
+        return self.is_large and bool(self.edge.min() > rise)
+
+    @property
+    def is_large(self) -> bool:
+        return self.is_rectangle and self.size >= _LARGE
+
+
 def _blocks(plane: np.ndarray, same: np.ndarray, step: float) -> np.ndarray:
     """Blocks of at least 2×2 pixels at the `same` extreme value, with steps at all their edges.
 
-    - sharp: twice those between neighbours elsewhere, but for one pixel in a thousand.
-    - whole: rectangles at a value that no other pixel comes near.
-    - deep: dark amid light that is even; noise would lift some pixels of a shadow.
+    A few that are sharp, or whole where no other pixel comes near their value; deep ones that are
+    dark where there is noise.
     """
-    nothing, seeds = np.zeros_like(same), np.zeros_like(same)
+    seeds = np.zeros_like(same)
     seeds[1:, 1:] = same[1:, 1:] & same[1:, :-1] & same[:-1, 1:] & same[:-1, :-1]
     if not seeds.any():
-        return nothing
+        return seeds
     labels, count = scipy.ndimage.label(same, _SQUARE)
     numbers = np.unique(labels[seeds])
-    around = scipy.ndimage.binary_dilation(np.isin(labels, numbers), _SQUARE)
     value, spread = float(plane[same][0]), float(np.ptp(plane))
-    steps = [np.diff(np.where(around, np.nan, plane), axis=axis).ravel() for axis in (0, 1)]
-    steps = np.concatenate(steps)
-    steps = np.append(np.abs(steps[np.isfinite(steps)]), 0.0)
-    usual = float(np.quantile(steps, 0.999))
-    gap = float(np.abs(plane[~same] - value).min())
-    few = numbers.size <= _BLOCKS and same.sum() < _MOST * plane.size
     least = max(_CERTAIN * step, 0.02 * spread)
+    few = numbers.size <= _BLOCKS and same.sum() < _MOST * plane.size
+    gap = float(np.abs(plane[~same] - value).min())
     is_alone = few and count == numbers.size and gap > least
     is_noisy = fine_noise(plane) > 0 and value == plane.min()
-    kinds: dict[str, list[int]] = {"sharp": [], "whole": [], "deep": []}
-    places, sizes = scipy.ndimage.find_objects(labels), np.bincount(labels.ravel())
+    usual = _usual_step(plane, np.isin(labels, numbers)) if few else np.inf
+    found = _each_block(plane, labels, numbers, value)
+    rules = (
+        (0.3, [one for one in found if few and one.is_sharp(least, usual)]),
+        (0.6, [one for one in found if is_alone and one.is_whole(spread)]),
+        (0.3, [one for one in found if is_noisy and one.is_deep(least)]),
+    )
+    light, marked = np.abs(plane - float(np.median(plane))), np.zeros_like(same)
+    for most, blocks in rules:
+        some = np.isin(labels, [one.number for one in blocks])
+        if len(blocks) <= _BLOCKS and light[some].sum() < most * light.sum():
+            marked |= some
+    return marked
+
+
+def _usual_step(plane: np.ndarray, blocks: np.ndarray) -> float:
+    """The largest step between neighbours but for one in a thousand, away from blocks."""
+    away = np.where(scipy.ndimage.binary_dilation(blocks, _SQUARE), np.nan, plane)
+    steps = np.concatenate([np.abs(np.diff(away, axis=axis)).ravel() for axis in (0, 1)])
+    return float(np.quantile(np.append(steps[np.isfinite(steps)], 0.0), 0.999))
+
+
+def _each_block(
+    plane: np.ndarray, labels: np.ndarray, numbers: np.ndarray, value: float
+) -> list[_Block]:
+    """The labelled blocks; of many only the large ones, since each takes time."""
+    places, sizes, found = scipy.ndimage.find_objects(labels), np.bincount(labels.ravel()), []
     for number in numbers:
-        rows, columns = places[number - 1]
-        is_rectangle = sizes[number] == (rows.stop - rows.start) * (columns.stop - columns.start)
-        is_large = is_rectangle and is_noisy and sizes[number] >= _LARGE
-        if not (few or is_large):
+        sides = places[number - 1]
+        is_rectangle = bool(sizes[number] == math.prod(one.stop - one.start for one in sides))
+        if numbers.size > _BLOCKS and not (is_rectangle and sizes[number] >= _LARGE):
             continue
-        part = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in (rows, columns))
-        one = labels[part] == number
-        edge = np.abs(plane[part][scipy.ndimage.binary_dilation(one, _SQUARE) & ~one] - value)
-        rise = edge.min()
-        kinds["sharp"] += [number] * bool(few and rise > max(2 * usual, least))
-        kinds["whole"] += [number] * bool(is_alone and is_rectangle and rise > spread / 8)
-        kinds["deep"] += [number] * bool(is_large and rise > max(least, np.median(edge) / 2))
-    light, found = np.abs(plane - float(np.median(plane))), nothing
-    for kind, most in (("sharp", 0.3), ("whole", 0.6), ("deep", 0.3)):
-        some = np.isin(labels, kinds[kind])
-        if len(kinds[kind]) <= _BLOCKS and light[some].sum() < most * light.sum():
-            found = found | some
+        part = tuple(slice(max(one.start - 1, 0), one.stop + 1) for one in sides)
+        own = labels[part] == number
+        around = scipy.ndimage.binary_dilation(own, _SQUARE) & ~own
+        edge = np.abs(plane[part][around] - value)
+        found.append(_Block(int(number), int(sizes[number]), is_rectangle, edge))
     return found
 
 
