@@ -88,7 +88,7 @@ class Case:
         captures = jax.tree.unflatten(structure, noisy)
         variances = [s**2 for s in noise]
         self.shape = (rows, columns)
-        self.recording = tc.Recording(captures, operator, noise_variance=variances)
+        self.recording = tc.Recording(captures, operator, noise_variance=variances, background=0.0)
         self.problem = self.recording.problem(tau=TAU, regulariser=VARIATION)
         basis = jax.device_put(np.eye(rows * columns).reshape(-1, rows, columns))
         seen = jax.tree.leaves(operator(basis))

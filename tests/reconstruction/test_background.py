@@ -10,15 +10,17 @@ import pytest
 import scipy.optimize
 
 import thincam_jax as tc
-from helpers import finite_difference
-from thincam_jax.imaging.operators import Matrix
+from helpers import finite_difference, quick
+from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
+from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.reconstruction import solve_fixed_point
+from thincam_jax.reconstruction.backgrounds import darkest, with_other_background
+from thincam_jax.reconstruction.closed_normal import LevelledNormal
 from thincam_jax.reconstruction.implicit_gradient import NeumannSeries
 from thincam_jax.reconstruction.normal_equations import normal_equations
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
-    darkest,
     gradient,
     objective,
     scene_level,
@@ -109,6 +111,85 @@ def test_dense_normal_equations_know_it():
         normal = normal_equations(problem, jnp.asarray(0.3))
         right = jnp.asarray(RNG.random(problem.image_shape))
         np.testing.assert_allclose(normal.applied(normal.solve(right)), right, atol=1e-10)
+
+
+def separable(weight, background, level=0.0):
+    """The problem of a separable camera with a capture of noise."""
+    camera = Separable(RNG.random((9, 4)), RNG.random((8, 5)))
+    given = {"weights": [weight], "background": background}
+    return InverseProblem(camera, [RNG.random((1, 9, 8)) + level], **given)
+
+
+@pytest.mark.parametrize("weight", [2.0, RNG.random((9, 8))], ids=["one", "many"])
+def test_normal_equations_of_one_capture_with_its_background(weight):
+    """Solutions against their application; the variance against the dense inverse."""
+    problem, shift = separable(weight, "unknown"), jnp.asarray(0.3)
+    right = jnp.asarray(RNG.random(problem.image_shape))
+    known = normal_equations(with_other_background(problem, "known"), shift)
+    levelled = LevelledNormal(problem, known)
+    for normal in (levelled, levelled.shifted(2 * shift)):
+        np.testing.assert_allclose(normal.applied(normal.solve(right)), right, atol=1e-9)
+    if np.size(weight) == 1:
+        assert isinstance(normal_equations(problem, shift), LevelledNormal)
+        matrix, weights, _ = dense(problem)
+        both = np.c_[matrix, np.ones(len(matrix))]
+        inverse = np.linalg.inv(both.T @ (weights[:, None] * both) + np.diag([0.3] * 20 + [0]))
+        found = levelled.variance()
+        np.testing.assert_allclose(np.ravel(found), np.diag(inverse)[:-1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("level", [2.0, -2.0])
+@pytest.mark.parametrize("weight", [2.0, RNG.random((9, 8))], ids=["one", "many"])
+def test_the_data_of_one_capture_has_a_background_above_zero(weight, level):
+    """ADMM's proximal map by scipy, with a background and where it would be negative."""
+    splitting = splitting_of(separable(weight, "nonnegative", level))
+    state = splitting.start(jnp.asarray(RNG.random((1, 1, 4, 5))))
+    (matrix, weights, seen), pull = dense(splitting.problem), splitting.penalties.data**0.5
+    root = np.sqrt(weights)
+    system = np.block([[root[:, None] * np.c_[matrix, np.ones(72)]], [pull * np.eye(20, 21)]])
+    right, least = np.r_[root * seen, pull * state.data[0].ravel()], np.r_[np.full(20, -np.inf), 0]
+    exact = scipy.optimize.lsq_linear(system, right, (least, np.inf), "bvls", tol=1e-14).x
+    assert (exact[-1] > 0) == (level > 0)
+    found = (splitting.reflected(state).data[0] + state.data[0]) / 2
+    np.testing.assert_allclose(np.ravel(found), exact[:20], rtol=1e-7, atol=1e-9)
+
+
+SPOTS = jnp.asarray(RNG.random((2, 12, 13)) ** 6)
+CAMERAS = {
+    "separable": Separable(RNG.random((24, 9)), RNG.random((28, 12))),
+    "dense": Matrix(RNG.random((24 * 28, 9 * 12)), (9, 12), (24, 28)),
+    "low rank": LowRank(
+        jnp.stack([jnp.ones((9, 12)), jnp.linspace(-0.5, 0.5, 12) * jnp.ones((9, 1))]),
+        CropConvolution(
+            jnp.asarray(RNG.random((2, 12, 13)) ** 6), 1.0, (24, 28), (9, 12), summed=1
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("solver", [tc.AdmmTV(), tc.Fista(), tc.Ridge(), tc.PlugAndPlay()])
+@pytest.mark.parametrize("camera", quick(CAMERAS, 1))
+def test_no_solver_sees_a_background_behind_operators(camera, solver):
+    """Levels of a quarter and all of the mean: one image; another, if it is known to be none."""
+    operator = CAMERAS[camera]
+    truth = resize(sample_image("camera", linear=True), (9, 12))
+    light = np.asarray(operator(jnp.asarray(truth)))
+    light = light + 0.002 * light.mean() * np.random.default_rng(2).standard_normal(light.shape)
+    light, brighter = light + light.mean() / 4, light + light.mean()
+    plain, other, wrong = (
+        np.asarray(tc.reconstruct(tc.Recording([seen], operator, background=b), solver).image)
+        for seen, b in ((light, None), (brighter, None), (brighter, 0.0))
+    )
+    np.testing.assert_allclose(other, plain, atol=0.01)
+    assert np.abs(wrong - plain).max() > 0.1
+
+
+def test_operators_that_leave_the_brightness_open_have_no_background():
+    """Uniform light casts uniform captures through them; nor have captures that are no images."""
+    for shape in ((4, 5), (20,)):
+        operator = Matrix(np.eye(20), (4, 5), shape)
+        found = tc.Recording([RNG.random(shape)], operator, noise_variance=0.01).problem()
+        assert not found.has_background
 
 
 def matrices():

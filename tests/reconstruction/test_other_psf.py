@@ -9,7 +9,8 @@ import scipy.signal
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import CropConvolution, Matrix
+from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable
+from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.reconstruction.other_psf import _FIT, NEGATIVE, RESIZE, TURN, _mirror, without_size
 
 RNG = np.random.default_rng(5)
@@ -97,3 +98,21 @@ def test_captures_that_are_no_images_are_not_inverted():
     recording = tc.Recording([capture], [matrix], noise_variance=1e-4)
     found = tc.reconstruct(recording, tc.AdmmTV(iterations=200, tolerance=1e-9))
     assert NEGATIVE not in found.reason
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+def test_inverted_captures_behind_operators_are_named(colours):
+    """By each solver; upright ones, also of a point, are not."""
+    random = np.random.default_rng(7)
+    sides = [(random.random((n, m)) < 0.5).astype(float) for n, m in ((24, 12), (28, 14))]
+    camera, point = Separable(*sides), np.zeros((12, 14))
+    point[2, 11] = 1.0
+    for image in (resize(sample_image("camera", linear=True), (12, 14)), point):
+        light = np.asarray(camera(jnp.asarray(image))) * np.ones((colours, 1, 1))
+        light += 0.01 * light.max() * random.standard_normal(light.shape)
+        for solver in (tc.Ridge(), tc.Fista(iterations=10), tc.AdmmTV(iterations=10)):
+            upright = tc.reconstruct(tc.Recording([light], camera), solver)
+            assert NEGATIVE not in upright.reason
+            if image is not point:
+                inverted = tc.reconstruct(tc.Recording([255 - light], camera), solver)
+                assert NEGATIVE in inverted.reason

@@ -288,7 +288,7 @@ def test_float32_keeps_its_digits_under_bright_light():
         camera = Separable(left.astype(dtype), right.astype(dtype)).with_modes()
         # The same numbers for both: the captures' own rounding is none of the solver's.
         given = seen.astype(np.float32).astype(dtype)
-        recording = tc.Recording(given, camera, noise_variance=1e-4)
+        recording = tc.Recording(given, camera, noise_variance=1e-4, background=0.0)
         images[dtype] = np.asarray(tc.reconstruct(recording, tc.Ridge(1.0)).image, np.float64)
     error = np.abs(images[np.float32] - images[np.float64]).max()
     assert error < 4e-5 * truth.std(), error / truth.std()
@@ -378,39 +378,81 @@ def test_rules_find_the_least_of_their_criterion(rule):
     assert rule == "likelihood" or float(jnp.sum((image - truth) ** 2)) < 1.15 * best
 
 
-def test_error_bars_are_the_diagonal_of_the_dense_inverse():
+def with_level(operator, captures, background):
+    """Matrix, captures and brightness of the image; a background to find is one more unknown."""
+    matrix, data = dense_camera(operator), np.ravel(captures)
+    flat = matrix.sum(axis=1)
+    if background is None:
+        uneven = flat - flat.mean()
+        level = min(uneven @ data / (uneven @ uneven), flat @ data / (flat @ flat))
+        return np.c_[matrix, np.ones(len(matrix))], data, level
+    return matrix, data, flat @ data / (flat @ flat)
+
+
+def inverse_of(matrix, inverse_prior):
+    """Of the normal equations; a background has no prior."""
+    more = matrix.shape[1] - len(inverse_prior)
+    return np.linalg.inv(matrix.T @ matrix / 4e-4 + np.pad(inverse_prior, (0, more)))
+
+
+@pytest.mark.parametrize("background", [0.0, None])
+def test_error_bars_are_the_diagonal_of_the_dense_inverse(background):
     """Of the separable, the dense_camera and the reduced camera."""
     operator = flatcam()
     captures, _ = captured(operator)
-    recording = tc.Recording(captures, operator, noise_variance=4e-4)
+    given = {"noise_variance": 4e-4, "background": background}
+    recording = tc.Recording(captures, operator, **given)
     sigma = tc.Ridge(0.5).deviation(recording)
-    matrix = dense_camera(operator)
-    flat = matrix.sum(axis=1)
-    level = flat @ np.ravel(captures) / (flat @ flat)
-    covariance = np.linalg.inv(matrix.T @ matrix / 4e-4 + 0.5 / level**2 * np.eye(180))
-    np.testing.assert_allclose(sigma.ravel(), np.sqrt(np.diag(covariance)), rtol=1e-8)
-    other = tc.Recording(captures, whole(operator), noise_variance=4e-4)
+    matrix, _, level = with_level(operator, captures, background)
+    covariance = inverse_of(matrix, 0.5 / level**2 * np.eye(180))
+    np.testing.assert_allclose(sigma.ravel(), np.sqrt(np.diag(covariance))[:180], rtol=1e-8)
+    other = tc.Recording(captures, whole(operator), **given)
     np.testing.assert_allclose(tc.Ridge(0.5).deviation(other), sigma, rtol=1e-8)
 
 
+@pytest.mark.parametrize("background", [0.0, None])
 @pytest.mark.parametrize("terms", [1, pytest.param(2, marks=pytest.mark.thorough)])
-def test_a_correlated_image(terms):
+def test_a_correlated_image(terms, background):
     """Against the posterior of a Gaussian image with that covariance, written out."""
     operator = flatcam(terms)
     captures, _ = captured(operator)
     near = [np.exp(-np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 3) for n in FLAT_FIELD]
-    matrix = dense_camera(operator)
-    flat = matrix.sum(axis=1)
-    level = flat @ np.ravel(captures) / (flat @ flat)
-    prior = level**2 * np.kron(*near)
-    posterior = np.linalg.inv(matrix.T @ matrix / 4e-4 + np.linalg.inv(prior))
-    mean = level + posterior @ matrix.T @ (np.ravel(captures) - level * flat) / 4e-4
-    recording = tc.Recording(captures, operator, noise_variance=4e-4)
+    matrix, data, level = with_level(operator, captures, background)
+    posterior = inverse_of(matrix, np.linalg.inv(level**2 * np.kron(*near)))
+    mean = np.full(matrix.shape[1], level)
+    mean[180:] = 0
+    mean += posterior @ matrix.T @ (data - matrix @ mean) / 4e-4
+    recording = tc.Recording(captures, operator, noise_variance=4e-4, background=background)
     solver = tc.Ridge(correlation=3.0, tolerance=1e-9)
-    np.testing.assert_allclose(tc.reconstruct(recording, solver).image.ravel(), mean, atol=1e-6)
+    found = tc.reconstruct(recording, solver).image.ravel()
+    np.testing.assert_allclose(found, mean[:180], atol=1e-6)
     if terms == 1:
         sigma = solver.deviation(recording)
-        np.testing.assert_allclose(sigma.ravel(), np.sqrt(np.diag(posterior)), rtol=1e-8)
+        np.testing.assert_allclose(sigma.ravel(), np.sqrt(np.diag(posterior))[:180], rtol=1e-8)
+
+
+@pytest.mark.parametrize("rule", quick(["gcv", "sure", "likelihood"], 0))
+def test_rules_find_the_background_with_the_image(rule):
+    """Of the image and a level without a prior, solved for together, which is several times it."""
+    operator, noise = flatcam(), 0.02
+    captures, _ = captured(operator, noise)
+    captures = captures + 3 * np.mean(captures)
+    given = {"weights": [1 / noise**2], "background": "unknown"}
+    problem = InverseProblem(operator, [captures[None]], **given)
+    matrix = np.c_[dense_camera(operator), np.ones(captures.size)] / noise
+    data, count = np.ravel(captures) / noise, captures.size
+    powers = np.linalg.eigvalsh(matrix[:, :-1].T @ matrix[:, :-1])
+
+    def value(rho):
+        prior = np.diag([rho] * 180 + [0])
+        found = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ data)
+        left, freedom = np.sum((data - matrix @ found) ** 2), np.sum(powers / (powers + rho))
+        if rule == "likelihood":
+            return left + found @ prior @ found + np.sum(np.log1p(powers / rho))
+        return count * left / (count - freedom) ** 2 if rule == "gcv" else left + 2 * freedom
+
+    found = float(choose_precision(problem, jnp.zeros(problem.image_shape), rule)[0])
+    assert value(found) <= min(map(value, np.geomspace(1e-2, 1e4, 200))) + 1e-6 * abs(value(found))
 
 
 @pytest.mark.thorough
@@ -433,3 +475,19 @@ def test_error_bars_cover_the_truth(count):
         covered.append(np.mean(gap < 1.96 * solver.deviation(recording)))
         errors.append(np.mean(gap**2))
     assert 0.93 < covered[0] < 0.97 and covered[1] > covered[0] and errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize("dead", quick([3, 9], 0))
+def test_few_dead_pixels_change_rules_and_error_bars_little(dead):
+    """Deviations by 5 % at most, the image by less than half of them; they read nonsense."""
+    operator = flatcam()
+    captures, _ = captured(operator)
+    valid = np.ones(FLAT_SENSOR, bool)
+    valid.flat[CHANCE.choice(valid.size, dead, replace=False)] = False
+    given, solver = {"noise_variance": 4e-4}, tc.Ridge("sure")
+    whole = tc.Recording(captures, operator, **given)
+    masked = tc.Recording(np.where(valid, captures, 1e4), operator, valid=valid, **given)
+    sigmas = [np.asarray(solver.deviation(one)) for one in (masked, whole)]
+    np.testing.assert_allclose(*sigmas, rtol=0.05)
+    images = [np.asarray(tc.reconstruct(one, solver).image) for one in (masked, whole)]
+    assert np.std(images[0] - images[1]) < 0.5 * np.mean(sigmas[1])

@@ -25,7 +25,11 @@ from thincam_jax.reconstruction.cut_psf import with_cut_psfs
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
-from thincam_jax.reconstruction.other_psf import better_psf, negative_captures
+from thincam_jax.reconstruction.other_psf import (
+    better_psf,
+    negative_behind_operators,
+    negative_captures,
+)
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -145,7 +149,7 @@ def _reconstruct(recording: Recording, solver, start, callback, tell) -> Reconst
         raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:
         result = solver.solve(recording)
-    return saying(result, reason, result.reason)
+    return saying(result, reason, result.reason, negative_behind_operators(recording))
 
 
 @checked

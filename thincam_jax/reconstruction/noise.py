@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.precision import product
 from thincam_jax.imaging.defects import defects, plateau, stuck
 from thincam_jax.imaging.operators import AbstractOperator, Separable
+from thincam_jax.reconstruction.unseen import unseen_defects
 
 
 def without_unknown(capture: Any) -> tuple[Any, np.ndarray | None]:
@@ -32,13 +32,13 @@ def valid_pixels(
     captures: Sequence[Float[Array, "..."]],
     known: Sequence[np.ndarray | None],
     valid: Sequence[Any] | None,
-    is_examined: bool,
+    operators: Sequence[AbstractOperator | None] | None,
 ) -> tuple[Bool[Array, "..."], ...] | None:
     """Masks of pixels that are known and valid; None: everywhere.
 
-    How many are masked or NaN is logged as a warning. If `is_examined`, so are those that are
-    saturated, on a plateau at the largest value of an image, and those that most captures find hot
-    or dead.
+    How many are masked or NaN is logged as a warning. If captures are to be examined, by their
+    `operators`, so are those that are saturated, on a plateau at the largest value of an image, and
+    those that most captures find hot or dead.
     """
     masks: list[Any] = list(valid or [np.True_] * len(captures))
     good = [
@@ -46,9 +46,10 @@ def valid_pixels(
         for k, c in zip(known, captures, strict=True)
     ]
     _exclude(masks, good, "masked or NaN")
-    if is_examined and not checks.holds_traced(captures):
+    if operators is not None and not checks.holds_traced((captures, operators)):
         images = [np.asarray(capture) for capture in captures]
-        odd = [_each(image.astype(np.float32), lambda p: defects(p) | stuck(p)) for image in images]
+        pairs = zip(images, operators, strict=True)
+        odd = [_each(image.astype(np.float32), _odd_behind(one)) for image, one in pairs]
         alike = [[other for other in odd if other.shape == one.shape] for one in odd]
         odd = [one & (2 * np.sum(s, axis=0) > len(s)) for one, s in zip(odd, alike, strict=True)]
         _exclude(masks, [~one for one in odd], "hot or dead")
@@ -78,6 +79,13 @@ def _exclude(masks: list[Any], good: Sequence[np.ndarray], why: str) -> None:
 def _each(image: np.ndarray, find: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     planes = image.reshape(-1, *image.shape[-2:])
     return np.stack([find(plane) for plane in planes]).reshape(image.shape)
+
+
+def _odd_behind(operator: AbstractOperator | None) -> Callable[[np.ndarray], np.ndarray]:
+    """The search for hot and dead pixels in a plane."""
+    if isinstance(operator, Separable):
+        return lambda plane: defects(plane) | stuck(plane) | unseen_defects(operator, plane)
+    return lambda plane: defects(plane) | stuck(plane)
 
 
 def _saturated(plane: np.ndarray) -> np.ndarray:
@@ -271,35 +279,6 @@ def is_below_black(capture: Float[Array, "*batch y x"], *, by_noise: bool) -> bo
         return bool(np.mean(below) > _NEGATIVE)
     deviation = jnp.sqrt(jnp.mean(estimate_noise(capture) ** 2))
     return bool(jnp.sqrt(jnp.mean(capture**2, where=below)) > _BY_NOISE * deviation)
-
-
-def unseen_variance(
-    operators: Sequence[AbstractOperator],
-    captures: Sequence[Float[Array, "*batch y x"]],
-    found: Float[Array, " capture"],
-) -> Float[Array, " capture"]:
-    """The lower of a variance `found` and that of what no image casts through a separable camera.
-
-    Both are too high at worst: that of the finest detail where the code is as fine as a pixel, that
-    of (1 − P) G, with P onto the columns of the two matrices, by light that the model lacks.
-    """
-    least = list(found)
-    for n, operator in enumerate(operators):
-        if isinstance(operator, Separable):
-            unseen = _unseen(operator.left, operator.right, captures[n])
-            least[n] = jnp.where(unseen > 0, jnp.minimum(found[n], unseen), found[n])
-    return jnp.stack(least)
-
-
-@jax.jit
-def _unseen(left: Float[Array, "k y m"], right: Float[Array, "k x n"], capture):
-    """Variance of a capture outside of the columns of two matrices; 0 where too little is."""
-    bases = [jnp.linalg.qr(jnp.concatenate(list(one), axis=1))[0] for one in (left, right)]
-    rows, columns = (product(basis, basis.T) for basis in bases)
-    lost = capture - product(product(rows, capture), columns)
-    freedom = math.prod(capture.shape[-2:]) - math.prod(basis.shape[1] for basis in bases)
-    count = freedom * capture.size / math.prod(capture.shape[-2:])
-    return jnp.sum(lost**2) / count if freedom >= _LEAST else jnp.zeros((), capture.dtype)
 
 
 def given_variances(

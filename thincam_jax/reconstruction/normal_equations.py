@@ -4,12 +4,8 @@ Dense: the Gram matrix once, a Cholesky factorisation for each μ. One separable
 weight: its modes, once, or those that it has kept; a `ReducedMatrix` brings its own. All else:
 conjugate gradients (`lineax.CG`), preconditioned for convolutions and for separable cameras of
 several terms or weights.
-
-Factorisations are not differentiated: derivatives follow from the equation itself
-(`jax.lax.custom_linear_solve`), so that equal eigenvalues do no harm.
 """
 
-import abc
 import functools
 import math
 from collections.abc import Sequence
@@ -27,18 +23,24 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
-from thincam_jax._core.precision import as_complex, product
-from thincam_jax.imaging.operators import (
-    AbstractOperator,
-    CropConvolution,
-    Matrix,
-    ReducedMatrix,
-    Separable,
-)
+from thincam_jax._core.precision import as_complex
+from thincam_jax.imaging.operators import CropConvolution, Matrix, ReducedMatrix, Separable
 from thincam_jax.imaging.operators.crop_convolution import cut, place
-from thincam_jax.imaging.operators.masked import Scaled
-from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.imaging.operators.separable import SeparableModes
+from thincam_jax.reconstruction.backgrounds import with_other_background
+from thincam_jax.reconstruction.closed_normal import (
+    AbstractNormal,
+    DenseNormal,
+    LevelledNormal,
+    ReducedNormal,
+    SeparableNormal,
+    by_modes,
+    gain_of,
+    gram_matrix,
+    inner,
+    with_weights,
+    without_gain,
+)
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,
@@ -60,66 +62,24 @@ _ROUNDING = 10
 _BEGINNING = 6
 
 
-class AbstractNormal(eqx.Module):
-    """The normal equations of a problem with a shift μ > 0, prepared for solution."""
-
-    problem: InverseProblem
-    shift: Float[Array, ""]
-
-    @abc.abstractmethod
-    def solve(self, right: Float[Array, "..."]) -> Float[Array, "..."]:
-        """z of a right-hand side b (*batch, channel, plane, y, x)."""
-
-    def solve_captures(self, captures: tuple[Float[Array, "..."], ...]):
-        """z of b = Σ Aᵀwg, and ⟨b, z⟩, by which ‖√w(Az − g)‖² + μ‖z‖² is below that of z = 0."""
-        right = back_projected(self.problem, captures)
-        solution = self.solve(right)
-        return solution, jnp.sum(right * solution)
-
-    def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
-        """These equations with another μ, without repeating what does not depend on it."""
-        return replace(self, shift=shift)
-
-    def variance(self) -> Float[Array, "*planes y x"]:
-        """The diagonal of (Σ AᵀwA + μ)⁻¹ in the shape of the operators' images."""
-        raise ValueError(
-            "the variance of each pixel has a closed form for dense matrices, for a ReducedMatrix "
-            "and for one separable term with one weight; this problem is none of those"
-        )
-
-    def settled(self) -> "AbstractNormal":
-        """These equations prepared for hundreds of solutions with one μ."""
-        return self
-
-    def __call__(self, right: Float[Array, "..."], guess: Float[Array, "..."]):
-        """z of b, differentiable; `guess` is what an iterative solution begins with."""
-        del guess
-        symmetric = lambda _, b: self.solve(b)  # noqa: E731
-        return jax.lax.custom_linear_solve(self.applied, right, symmetric, symmetric=True)
-
-    def applied(self, image: Float[Array, "..."]):
-        """(Σ AᵀwA + μ) z."""
-        seen = tuple(forward(operator, image) for operator in self.problem.operators)
-        return back_projected(self.problem, seen) + self.shift * image
-
-
 def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> AbstractNormal:
     """The solver that suits the operators and weights of a problem."""
     fixed = jax.lax.stop_gradient(problem)
-    same = [math.prod(w.shape[: -len(detector_shape(o))]) == 1 for o, w in _weighted(fixed)]
-    bare = [_bare(o) for o in fixed.operators]
+    pairs = with_weights(fixed)
+    same = [math.prod(w.shape[: -len(detector_shape(o))]) == 1 for o, w in pairs]
+    bare = [without_gain(o) for o in fixed.operators]
     if all(same) and all(isinstance(o, Matrix) for o in bare):
-        return DenseNormal(problem, shift, _gram(fixed))
+        return DenseNormal(problem, shift, gram_matrix(fixed))
     if len(bare) == 1 and isinstance(bare[0], ReducedMatrix) and fixed.weights[0].size == 1:
         return ReducedNormal(problem, shift)
     if len(bare) == 1 and isinstance(bare[0], Separable):
         modes = bare[0].modes or _with_modes(bare[0]).modes
         assert modes is not None
-        values = jnp.abs(_gain(fixed.operators[0])) * modes.values
+        values = jnp.abs(gain_of(fixed.operators[0])) * modes.values
         weighted = replace(modes, values=jnp.sqrt(jnp.mean(fixed.weights[0])) * values)
-        closed = bare[0].terms == 1 and not fixed.has_background
-        if closed and fixed.weights[0].size == 1:
-            return SeparableNormal(problem, shift, weighted)
+        if bare[0].terms == 1 and fixed.weights[0].size == 1:
+            known = SeparableNormal(with_other_background(problem, "known"), shift, weighted)
+            return LevelledNormal(problem, known) if problem.has_background else known
         return IterativeNormal(problem, shift, weighted)
     convolved = convolutions(fixed)
     if convolved is None:
@@ -128,79 +88,15 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
     return IterativeNormal(problem, shift, powers=powers, uniform=uniform)
 
 
-class DenseNormal(AbstractNormal):
-    """Solutions by the Cholesky factor of the Gram matrix (pixel, pixel) plus μ."""
-
-    gram: Float[Array, "n n"]
-    factor: Float[Array, "n n"]
-
-    def __init__(self, problem: InverseProblem, shift: Float[Array, ""], gram: Float[Array, "n n"]):
-        self.problem, self.shift, self.gram = problem, shift, gram
-        self.factor = _cholesky(gram, jax.lax.stop_gradient(shift))
-
-    def solve(self, right: Float[Array, "..."]):
-        flat = right.reshape(-1, self.gram.shape[0]).T
-        return jax.scipy.linalg.cho_solve((self.factor, True), flat).T.reshape(right.shape)
-
-    def shifted(self, shift: Float[Array, ""]):
-        return DenseNormal(self.problem, shift, self.gram)
-
-    def variance(self):
-        unit = jnp.eye(self.gram.shape[0], dtype=self.gram.dtype)
-        root = jax.scipy.linalg.solve_triangular(self.factor, unit, lower=True)
-        return jnp.sum(root**2, axis=0).reshape(self.problem.operators[0].in_shape)
-
-
-class SeparableNormal(AbstractNormal):
-    """Solutions by the modes of a separable camera, weight and gain included in their values."""
-
-    modes: SeparableModes
-
-    def solve(self, right: Float[Array, "..."]):
-        return _by_modes(self.modes, jax.lax.stop_gradient(self.shift), right)
-
-    def variance(self):
-        inverse = 1 / (self.modes.values**2 + self.shift)
-        return product(product(self.modes.rows**2, inverse), (self.modes.columns**2).T)
-
-
-class ReducedNormal(AbstractNormal):
-    """Solutions by the eigenvectors of a reduced matrix, for any μ."""
-
-    def solve(self, right: Float[Array, "..."]):
-        bare, power = self._powers()
-        modes = bare.modes(right.reshape(-1, bare.values.size)) / power
-        return each_times(bare.vectors, modes).reshape(right.shape)
-
-    def variance(self):
-        bare, power = self._powers()
-        return jnp.sum(bare.vectors**2 / power, axis=1).reshape(bare.in_shape)
-
-    def settled(self):
-        bare, power = self._powers()
-        inverse = product(bare.vectors / power, bare.transposed)
-        return InverseNormal(self.problem, self.shift, inverse)
-
-    def _powers(self):
-        """The operator, and the eigenvalues of the whole, μ included."""
-        fixed, shift = jax.lax.stop_gradient((self.problem, self.shift))
-        (operator,), (weight,) = fixed.operators, fixed.weights
-        bare = _bare(operator)
-        assert isinstance(bare, ReducedMatrix)
-        return bare, weight.reshape(()) * (_gain(operator) * bare.values) ** 2 + shift
-
-
-class InverseNormal(AbstractNormal):
-    """Solutions by the inverse matrix itself: one product each."""
-
-    inverse: Float[Array, "n n"]
-
-    def solve(self, right: Float[Array, "..."]):
-        flat = right.reshape(-1, self.inverse.shape[0])
-        return each_times(jax.lax.stop_gradient(self.inverse), flat).reshape(right.shape)
-
-    def shifted(self, shift: Float[Array, ""]):
-        return normal_equations(self.problem, shift)
+def levelled_equations(problem: InverseProblem, shift: Float[Array, ""]) -> AbstractNormal:
+    """Normal equations whose backgrounds may be kept from being negative."""
+    if problem.has_background and len(problem.operators) == 1:
+        return LevelledNormal(
+            problem, normal_equations(with_other_background(problem, "known"), shift)
+        )
+    normal = normal_equations(problem, shift)
+    is_iterative = problem.background != "nonnegative" or isinstance(normal, IterativeNormal)
+    return normal if is_iterative else IterativeNormal(problem, shift)
 
 
 class IterativeNormal(AbstractNormal):
@@ -260,7 +156,7 @@ class IterativeNormal(AbstractNormal):
                 return nearest
             found = self.uniform
             return lambda image: nearest(image) + found.solved(image, self.shift)
-        return self.modes and functools.partial(_by_modes, self.modes, self.shift)
+        return self.modes and functools.partial(by_modes, self.modes, self.shift)
 
     def least_squares(
         self, captures: tuple[Float[Array, "..."], ...], tolerance: Number, steps: int
@@ -336,12 +232,8 @@ class UniformLight(eqx.Module):
 
     def solved(self, right: Float[Array, "..."], shift: Float[Array, ""]) -> Float[Array, "..."]:
         """d dᵀb / dᵀ(AᵀwA + μ)d."""
-        size = self.power + shift * _inner(self.image, self.image)
-        return self.image * (_inner(self.image, right) / or_one(size))
-
-
-def _inner(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    return jnp.sum(a * b, axis=(-3, -2, -1), keepdims=True)
+        size = self.power + shift * inner(self.image, self.image)
+        return self.image * (inner(self.image, right) / or_one(size))
 
 
 @jax.jit
@@ -428,52 +320,6 @@ def _seen(sensor: int, field: int, window: int, start: int, begin: int) -> np.nd
     return np.clip(both, 0, None) / field
 
 
-def _weighted(problem: InverseProblem):
-    return zip(problem.operators, problem.weights, strict=True)
-
-
-def _bare(operator: AbstractOperator) -> AbstractOperator:
-    """The operator without the gain that a `ScaledProblem` gave it."""
-    return operator.operator if isinstance(operator, Scaled) else operator
-
-
-def _gain(operator: AbstractOperator):
-    return operator.gain if isinstance(operator, Scaled) else 1.0
-
-
-@jax.jit
-def _gram(problem: InverseProblem) -> Float[Array, "n n"]:
-    """Σ AᵀwA; with backgrounds to find, of columns of A less their means by the weights."""
-    parts = []
-    for operator, weight in _weighted(problem):
-        bare, gain = _bare(operator), _gain(operator)
-        assert isinstance(bare, Matrix)
-        matrix = bare.matrix
-        if weight.size == 1:
-            even = weight.reshape(()) * gain**2
-            parts.append(even * product(matrix.T, matrix))
-            total, pulled = even * matrix.shape[0], even * jnp.sum(matrix, axis=0)
-        else:
-            rows = weight.reshape(weight.shape[-len(detector_shape(operator)) :])
-            rows = jnp.broadcast_to(rows, detector_shape(operator)).reshape(-1, 1)
-            parts.append(gain**2 * product(matrix.T, rows * matrix))
-            total, pulled = gain**2 * jnp.sum(rows), gain**2 * jnp.sum(rows * matrix, axis=0)
-        if problem.has_background:
-            parts.append(-jnp.outer(pulled, pulled) / or_one(total))
-    return sum(parts[1:], start=parts[0])
-
-
-@jax.jit
-def _cholesky(gram, shift):
-    return jnp.linalg.cholesky(gram + shift * jnp.eye(gram.shape[0], dtype=gram.dtype))
-
-
 @jax.jit
 def _with_modes(operator: Separable) -> Separable:
     return operator.with_modes()
-
-
-def _by_modes(modes: SeparableModes, shift, right):
-    """(AᵀA + μ)⁻¹ of an image in the modes of A."""
-    inside = product(product(modes.rows.T, right), modes.columns) / (modes.values**2 + shift)
-    return modes.image(inside)

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.grids import block_sum
 from thincam_jax._core.precision import product
 from thincam_jax._core.quick_programs import quickly_compiled
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Stacked
@@ -206,30 +205,6 @@ def with_background(
     return difference - (jnp.clip(level, -highest, 0) if background == "nonnegative" else level)
 
 
-# Side of the blocks of pixels of which the darkest limits a background, and its standard errors.
-_BLOCK, _ERRORS = 8, 4
-
-
-@quickly_compiled
-def darkest(
-    captures: Sequence[Float[Array, "..."]], weights: Sequence[Float[Array, "..."]]
-) -> tuple[Float[Array, "..."], ...]:
-    """Highest background of each capture: the mean of its darkest block, and four errors of it."""
-
-    def of(capture, weight):
-        whole = jnp.broadcast_to(weight, jnp.broadcast_shapes(weight.shape, capture.shape))
-        capture = jnp.where(whole > 0, capture, 0)
-        inner = tuple(slice(n - n % _BLOCK) for n in capture.shape[-2:])
-        sums = (block_sum((whole * capture**n)[..., *inner], _BLOCK) for n in range(3))
-        count, light, squares = sums
-        mean = light / or_one(count)
-        variance = jnp.maximum(squares / or_one(count) - mean**2, 0) / or_one(count)
-        limits = jnp.where(count > _BLOCK**2 / 2, mean + _ERRORS * jnp.sqrt(variance), jnp.inf)
-        return jnp.min(limits, axis=(-2, -1), keepdims=True)
-
-    return tuple(map(of, captures, weights))
-
-
 def lit(problem: InverseProblem, image: Image) -> tuple[Bool[Array, "..."], ...]:
     """Whether the background of each capture that fits an image best is positive."""
     parts = zip(problem.operators, problem.captures, problem.weights, strict=True)
@@ -331,7 +306,7 @@ def with_tau(problem: InverseProblem, tau: Number) -> InverseProblem:
 
 
 # Part of the squares of a uniform image's capture that must not be uniform to show its brightness.
-_UNEVEN = 1e-3
+UNEVEN = 1e-3
 
 
 def uniform_level(
@@ -355,7 +330,7 @@ def uniform_level(
         if has_background:
             whole, uneven = flat, flat - weighted_mean(weight, flat, len(axes))
             even = weighted_mean(weight, flat**2, len(axes))
-            shown = weighted_mean(weight, uneven**2, len(axes)) > _UNEVEN * even
+            shown = weighted_mean(weight, uneven**2, len(axes)) > UNEVEN * even
             capture = capture - weighted_mean(weight, capture, len(axes))
             spread = jnp.sqrt(weighted_mean(weight, capture**2, len(axes)))
             gain = jnp.sqrt(or_one(jnp.sqrt(even * operator.mean_power())))

@@ -21,13 +21,13 @@ from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.imaging.operators.masked import Scaled
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.assembly import convolution_problem, fitting_field
+from thincam_jax.reconstruction.backgrounds import shows_brightness
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.noise import (
     estimate_variance,
     given_variances,
     is_below_black,
-    unseen_variance,
     valid_pixels,
     without_unknown,
 )
@@ -41,6 +41,7 @@ from thincam_jax.reconstruction.synthesis import (
     synthesis_matrix,
     with_channel,
 )
+from thincam_jax.reconstruction.unseen import unseen_variance
 
 
 class Recording(Module):
@@ -59,11 +60,12 @@ class Recording(Module):
       (`numpy.ma`) or NaN are not valid either. By default neither are hot and dead pixels, nor
       those of a plateau at the largest value, which are saturated. A warning says how many.
     - `background`: known light that is not the scene's, such as a black level or a dark frame: one
-      for all captures, or one for each, that broadcasts to them. By default it is unknown behind
-      `Cameras` and `Psfs`: a uniform background of each capture and colour is found with the image
-      (but by `Wiener`, `FringeScanning` and `PoissonTV`). It is negative only in captures that are
-      partly darker than black by more than noise. Give 0 where there is none to `Ridge` of a dark
-      room, which is otherwise some 0.6 dB worse. 0 with operators.
+      for all captures, or one for each, that broadcasts to them. By default it is unknown: a
+      uniform background of each capture and colour is found with the image (but by `Wiener`,
+      `FringeScanning` and `PoissonTV`). It is negative only in captures that are partly darker than
+      black by more than noise. Give 0 where there is none to `Ridge` of a dark room, which is
+      otherwise some 0.6 dB worse. With operators it is 0 where a uniform image casts a uniform
+      capture, which leaves the brightness open, or captures are no images.
 
     **Errors**: ValueError, one line, for captures that do not fit the imaging model.
 
@@ -128,8 +130,10 @@ class Recording(Module):
         if noise_variance is not None:
             given_variances(noise_variance, self.captures)  # refuses others
         self.valid = None if valid is None else self._masks(valid)
-        is_examined = valid is None and self._axes() == 2
-        self.valid = valid_pixels(self.captures, known, self.valid, is_examined)
+        examined = None
+        if valid is None and self._axes() == 2:
+            examined = getattr(imaging_model, "operators", [None] * len(self.captures))
+        self.valid = valid_pixels(self.captures, known, self.valid, examined)
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
         if not isinstance(imaging_model, Stacked):  # operators may have masks of their own
@@ -326,16 +330,32 @@ class Recording(Module):
 
     def _kind_of_background(self, captures, synthesis: Any, nonnegative: bool) -> Background:
         """Not negative but in differences of captures, and if something was subtracted before."""
-        if self.background is not None or isinstance(self.imaging_model, Stacked):
+        if self.background is not None or not self.shows_brightness:
             return "known"
         if not nonnegative or (synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))):
             return "unknown"
         # Where it leaves the brightness open, a negative background is far worse than none.
-        is_open = isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None
+        model = self.imaging_model
+        is_open = not isinstance(model, Cameras) and getattr(model, "field_shape", None) is None
         known = [c for c in captures if not checks.is_traced(c)]
         with jax.ensure_compile_time_eval():  # captures that are known stay so under jit
             below = any(is_below_black(c, by_noise=is_open) for c in known)
         return "unknown" if below else "nonnegative"
+
+    @property
+    def shows_brightness(self) -> bool:
+        """Whether captures tell uniform light of the scene from a background.
+
+        With operators that are traced, or whose captures are no images, nobody asks.
+        """
+        operators = getattr(self.imaging_model, "operators", None)
+        if operators is None:
+            return True
+        if self._axes() != 2 or checks.holds_traced(operators):
+            return False
+        with jax.ensure_compile_time_eval():  # operators that are known stay so under jit
+            uniform = jnp.ones((1,) * 4, self.captures[0].dtype)
+            return bool(np.all(jax.device_get(shows_brightness(operators, uniform))))
 
     @property
     def is_above_black(self) -> bool:
@@ -396,7 +416,7 @@ class Recording(Module):
         if any(len(s) < 2 for one in given for s in shapes_of(one.out_shape)):
             raise ValueError("give noise_variance: it is estimated from captures that are images")
         found = estimate_variance(captures, None if valid[0] is None else valid)
-        return unseen_variance(given, captures, found) if valid[0] is None else found
+        return unseen_variance(given, captures, valid, found)
 
     def _pitch(self, dtype) -> Float[Array, ""]:
         if isinstance(self.imaging_model, Cameras):

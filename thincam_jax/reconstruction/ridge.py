@@ -46,17 +46,14 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Number, is_traced
 from thincam_jax._core.precision import product
 from thincam_jax._core.quantity import FieldError, quantity, whole
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.imaging.operators.separable import SeparableModes
+from thincam_jax.reconstruction.closed_normal import AbstractNormal, LevelledNormal, SeparableNormal
 from thincam_jax.reconstruction.iterate import Outcome, outcome_of_run
-from thincam_jax.reconstruction.normal_equations import (
-    IterativeNormal,
-    SeparableNormal,
-    normal_equations,
-)
+from thincam_jax.reconstruction.normal_equations import IterativeNormal, normal_equations
 from thincam_jax.reconstruction.outside_light import reaching_beyond
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
@@ -69,6 +66,7 @@ from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis, as_tolerance
+from thincam_jax.reconstruction.unseen import filled_by_images
 
 Rule = Literal["gcv", "sure", "likelihood"]
 
@@ -77,6 +75,7 @@ RULES: tuple[Rule, ...] = ("gcv", "sure", "likelihood")
 # ρ is searched on a grid from 1e-12 to 1e4 of the largest eigenvalue of AᵀA, then between the
 # neighbours of the best, twice: to 0.2 %.
 _STEPS, _ZOOMS, _DECADES = 33, 3, (-12.0, 4.0)
+_MASKED = 0.05  # of the pixels, which change ρ and the deviations as little
 
 
 def _checked_ridge(name: str, ridge: Any) -> float | Rule:
@@ -183,10 +182,10 @@ class Ridge(AbstractSolver):
         **Errors**: ValueError for operators without a closed form: convolutions, several terms.
         """
         _, white, _, prior, precision = self._posed(recording)
-        scaled = ScaledProblem(white)
+        scaled = ScaledProblem(_of_one_weight(white))
         normal = normal_equations(scaled.problem, precision / scaled.curvature)
-        if prior is not None and isinstance(normal, SeparableNormal):
-            normal = SeparableNormal(normal.problem, normal.shift, prior.modes(normal.modes))
+        if prior is not None:
+            normal = prior.coloured(normal)
         return jnp.sqrt(normal.variance() / scaled.curvature)
 
     def _posed(self, recording):
@@ -291,7 +290,7 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
     scaled = ScaledProblem(about)
     inside = scaled.problem
     normal = normal_equations(inside, precision / scaled.curvature)
-    if isinstance(normal, SeparableNormal):
+    if isinstance(_without_level(normal), SeparableNormal):
         return _by_modes(about, scaled.curvature, normal, mean)
     if isinstance(normal, IterativeNormal):
         found = normal.least_squares(inside.captures, tolerance, iterations)
@@ -307,19 +306,40 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
     return mean + change * scaled.image_unit, (unit * before, unit * after), error, steps
 
 
-def _by_modes(about: InverseProblem, curvature, normal: SeparableNormal, mean):
+def _without_level(normal: AbstractNormal) -> AbstractNormal:
+    return normal.known if isinstance(normal, LevelledNormal) else normal
+
+
+def _by_modes(about: InverseProblem, curvature, normal: AbstractNormal, mean):
     """Ridge solution in closed form, scaled after the captures' modes are taken: no copies."""
     (capture,), weight = about.captures, about.weights[0].reshape(())
-    modes, operator_unit = normal.modes, jnp.sqrt(curvature / or_one(weight))
+    known = _without_level(normal)
+    assert isinstance(known, SeparableNormal)
+    modes, operator_unit = known.modes, jnp.sqrt(curvature / or_one(weight))
     seen = modes.seen(capture)
     unit = or_one(jnp.max(jnp.abs(seen)))
     pulled = modes.values * (seen / unit)
-    kept = pulled / (modes.values**2 + normal.shift)
+    kept = pulled / (modes.values**2 + known.shift)
+    if about.has_background:
+        uniform, left = modes.uniform(), known.shift / (modes.values**2 + known.shift)
+        size = math.prod(capture.shape[-2:]) - jnp.sum(uniform**2)
+        level = _level(uniform, left, seen / unit, size)
+        kept = kept - level * modes.values * uniform / (modes.values**2 + known.shift)
     image = mean + modes.image(kept)[..., None, :, :] * (unit / operator_unit)
     before = jnp.sum((capture / unit) ** 2) / 2
     after = jnp.maximum(before - jnp.sum(pulled * kept) / 2, 0)
     scale = weight * unit**2
     return image, (scale * before, scale * after), jnp.sum(0 * image), jnp.asarray(1)
+
+
+def _level(uniform, left, seen, size) -> Float[Array, "*batch 1 1"]:
+    """The uniform background of captures without a mean, with the image eliminated.
+
+    - `uniform`, `seen`: modes of a capture of 1 and of the captures; `left`: the part of them that
+      a ridge leaves. `size`: squares of a capture of 1 outside of the modes.
+    """
+    found = jnp.sum(uniform * (left - 1) * seen, axis=(-2, -1), keepdims=True)
+    return found / or_one(size + jnp.sum(left * uniform**2))
 
 
 @jax.jit
@@ -372,11 +392,32 @@ class MarkovPrior(eqx.Module):
         """L z."""
         return product(product(self.rows, white), self.columns.T)
 
+    def coloured(self, normal: AbstractNormal) -> AbstractNormal:
+        """The normal equations of z with their solutions as images, for the variance."""
+        if isinstance(normal, LevelledNormal):
+            parts = self.coloured(normal.known), self.image(normal.taken)
+            return eqx.tree_at(lambda one: (one.known, one.taken), normal, parts)
+        if isinstance(normal, SeparableNormal):
+            return replace(normal, modes=self.modes(normal.modes))
+        return normal
+
     def modes(self, modes: SeparableModes) -> SeparableModes:
         """Modes of z as images: modes for `ridge_by_modes` under this prior."""
         return replace(
             modes, rows=product(self.rows, modes.rows), columns=product(self.columns, modes.columns)
         )
+
+
+def _of_one_weight(problem: InverseProblem) -> InverseProblem:
+    """A problem whose few masked pixels behind a separable camera are what an image casts."""
+    (operator, *others), (weight, *_) = problem.operators, problem.weights
+    if others or not isinstance(operator, Separable) or weight.size == 1 or is_traced(weight):
+        return problem
+    valid, most = weight > 0, jnp.max(weight)
+    if not bool(jnp.all((weight == most) | ~valid) & (jnp.mean(valid) > 1 - _MASKED)):
+        return problem
+    filled = filled_by_images(operator, problem.captures[0], valid)
+    return eqx.tree_at(lambda p: (p.captures, p.weights), problem, ((filled,), (most,)))
 
 
 def choose_precision(
@@ -389,36 +430,48 @@ def choose_precision(
     **Errors**: ValueError unless the problem is of one separable term with one weight.
     """
     checks.choice("rule", rule, RULES)
-    unit = jnp.ones((), problem.captures[0].dtype)
-    normal = normal_equations(problem, unit)
+    problem, unit = _of_one_weight(problem), jnp.ones((), problem.captures[0].dtype)
+    normal = _without_level(normal_equations(problem, unit))
     if not isinstance(normal, SeparableNormal):
         raise ValueError(
             f"ridge = {rule!r} needs the modes of one separable term with one weight; give a "
-            "number, or one term (truncated(terms=1).operator) and no dead pixels"
+            "number, or one term (truncated(terms=1).operator) and few dead pixels"
         )
     (difference,) = residuals(problem, mean)
     weighted = -jnp.sqrt(problem.weights[0]) * difference
-    return _least(normal.modes, weighted, rule)
+    return _least(normal.modes, weighted, rule, problem.has_background)
 
 
-@jax.jit(static_argnames="rule")
-def _least(modes: SeparableModes, captures, rule: Rule):
-    """The minimum over log ρ, by three grids of decreasing range."""
+@functools.partial(jax.jit, static_argnames=("rule", "has_level"))
+def _least(modes: SeparableModes, captures, rule: Rule, has_level: bool):
+    """The minimum over log ρ, by three grids of decreasing range.
+
+    - `has_level`: whether a uniform background of each image is found, for each ρ.
+    """
     seen = modes.seen(captures)
     power = (modes.values / jnp.max(modes.values)) ** 2
     assert modes.seen_rows is not None and modes.seen_columns is not None
-    outside = captures - product(product(modes.seen_rows, seen), modes.seen_columns.T)
-    outside, squares = jnp.sum(outside**2), jnp.sum(seen**2, axis=tuple(range(seen.ndim - 2)))
-    images = captures.size // (captures.shape[-2] * captures.shape[-1])
-    count = captures.size
+    beyond = captures - product(product(modes.seen_rows, seen), modes.seen_columns.T)
+    images, batch = captures.size // math.prod(captures.shape[-2:]), tuple(range(seen.ndim - 2))
+    count, uniform = captures.size, modes.uniform()
+    outside, squares = jnp.sum(beyond**2), jnp.sum(seen**2, axis=batch)
+    beyond = jnp.sum(beyond, axis=(-2, -1), keepdims=True)
+    size = count // images - jnp.sum(uniform**2)  # of a capture of 1, outside of the modes
+
+    def without_level(left):
+        """Squares of captures less their background, in the modes, and outside of them."""
+        level = _level(uniform, left, seen, size)
+        inside = jnp.sum((seen - level * uniform) ** 2, axis=batch)
+        return inside, outside - jnp.sum(level * (2 * beyond - level * size))
 
     def criterion(exponent):
-        kept = power / (power + 10.0**exponent)
-        if rule == "likelihood":  # of captures of variance 1 + s²t²/ρ in each mode
-            left = 10.0**exponent / (power + 10.0**exponent)
-            return jnp.sum(squares * left) - images * jnp.sum(jnp.log(left)) + outside
-        residual = jnp.sum(squares * (1 - kept) ** 2) + outside
-        freedom = images * jnp.sum(kept)
+        # Left of a mode; 1/left is its variance in captures, 1 + s²t²/ρ, under the prior.
+        left = 10.0**exponent / (power + 10.0**exponent)
+        inside, rest = without_level(left) if has_level else (squares, outside)
+        if rule == "likelihood":
+            return jnp.sum(inside * left) - images * jnp.sum(jnp.log(left)) + rest
+        residual = jnp.sum(inside * left**2) + rest
+        freedom = images * jnp.sum(power / (power + 10.0**exponent))
         if rule == "gcv":
             # Avoids 0/0 if nothing is filtered out.
             return count * residual / jnp.maximum(count - freedom, 0.5) ** 2

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core.precision import squared_modulus
-from thincam_jax.imaging.operators import AbstractOperator, CropConvolution
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Separable
 from thincam_jax.imaging.operators.masked import Scaled
+from thincam_jax.reconstruction.closed_normal import without_gain
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,
@@ -130,8 +131,8 @@ def _norm(problem: InverseProblem, iterations: int, whole: bool) -> Float[Array,
     """‖√w A‖ with a margin, by the power method, at most the bound of the spectra."""
     dtype = problem.captures[0].dtype
     (first, *others), (weight, *_) = problem.operators, problem.weights
-    alone = not others and weight.size == 1 and (whole or not problem.has_background)
-    if alone:  # the operator may know its own norm
+    is_known = whole or not problem.has_background or isinstance(without_gain(first), Separable)
+    if not others and weight.size == 1 and is_known:  # the operator may know its own norm
         found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=iterations, dtype=dtype)
     else:
         found = WeightedOperator(problem, whole).norm(iterations=iterations, dtype=dtype)

@@ -45,17 +45,14 @@ from thincam_jax.reconstruction.admm import (
     Penalties,
     State,
 )
-from thincam_jax.reconstruction.normal_equations import (
-    AbstractNormal,
-    IterativeNormal,
-    normal_equations,
-)
+from thincam_jax.reconstruction.backgrounds import darkest
+from thincam_jax.reconstruction.closed_normal import AbstractNormal, LevelledNormal
+from thincam_jax.reconstruction.normal_equations import levelled_equations
 from thincam_jax.reconstruction.problem import (
     Background,
     InverseProblem,
     back_projected,
     convolutions,
-    darkest,
     lit,
     or_one,
     with_background,
@@ -408,9 +405,7 @@ class DirectSplitting(AbstractSplitting):
         power = (problem.tau_unit**2 / scaled.curvature).astype(self.tau.dtype)
         mean = jax.lax.stop_gradient(or_one(power))
         self.penalties = Penalties(mean, mean, mean)
-        self.normal = normal_equations(self.problem, self.penalties.data)
-        if problem.background == "nonnegative" and not isinstance(self.normal, IterativeNormal):
-            self.normal = IterativeNormal(self.problem, self.penalties.data)
+        self.normal = levelled_equations(self.problem, self.penalties.data)
 
     def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
         captures = tuple(c / self.capture_unit for c in captures)
@@ -439,12 +434,17 @@ class DirectSplitting(AbstractSplitting):
         return State((2 * self._data(q) - q,), slopes, allowed)
 
     def _data(self, q: Image) -> Image:
-        """z of the data; with a background ≥ 0, solved with just those that are positive for z.
+        """z of the data; with backgrounds ≥ 0, solved with just those that are positive for z.
 
-        The sets are found by Newton's method, the gradient is that of the last solution.
+        That of one capture has a closed form. The sets of several are found by Newton's method, the
+        gradient is that of the last solution.
         """
-        if self.problem.background != "nonnegative":
+        problem = self.problem
+        if problem.background != "nonnegative":
             return self.normal(self.pulled + self.penalties.data * q, q)
+        if isinstance(self.normal, LevelledNormal):
+            found = self.normal.known(self.pulled + self.penalties.data * q, q)
+            return self.normal.levelled(found, -self.normal.mean_of(problem.captures[0]))
 
         def solved(splitting, q, found, guess):
             problem, normal = splitting.problem, replace(splitting.normal, lit=found)

@@ -45,9 +45,9 @@ def diagonal_cells(shape: tuple[int, int]) -> list[tuple[int, int]]:
 def reconstruct_targets(
     system: AbstractOperator, solver: AbstractSolver, captures: ScreenCaptures
 ) -> Reconstruction:
-    """All targets at once, (target, *channel, y, x)."""
-    variance = captures.variance[None]
-    return reconstruct(Recording(captures.images[None], [system], noise_variance=variance), solver)
+    """All targets at once, (target, *channel, y, x); what a study leaves in them stays light."""
+    given = {"noise_variance": captures.variance[None], "background": 0.0}
+    return reconstruct(Recording(captures.images[None], [system], **given), solver)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,11 @@ class SeparableModes(eqx.Module):
             )
         return product(product(self.seen_rows.T, captures), self.seen_columns)
 
+    def uniform(self) -> Float[Array, "m n"]:
+        """Coefficient of each mode of one term in a capture of 1."""
+        assert self.seen_rows is not None and self.seen_columns is not None
+        return jnp.outer(self.seen_rows.sum(axis=0), self.seen_columns.sum(axis=0))
+
     def image(self, coefficients: Float[Array, "*batch m n"]) -> Float[Array, "*batch m n"]:
         """Image of a coefficient of each mode."""
         return product(product(self.rows, coefficients), self.columns.T)
