@@ -97,6 +97,7 @@ MODULES = (
     "design.cell_masks",
     "design.cell_search",
     "design.expected_error",
+    "design.recommendation",
     "design.limit",
     "design.objectives",
     "design.phase_mask",
@@ -285,6 +286,7 @@ def to_rst(app, what, name, obj, options, lines):
 # A script's card in the gallery is one square of a figure of docs/images: left, top and side in
 # pixels. The scripts' figures have many panels, which nobody could read at that size.
 CARDS = {
+    "atlas_of_masks": ("atlas-masks.png", 437, 25, 179),
     "calibrate_psf": ("calibration.png", 402, 66, 186),
     "colour_sensor": ("rig-colour.png", 362, 66, 192),
     "compare_masks": ("masks.png", 185, 20, 147),

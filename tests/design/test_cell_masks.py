@@ -133,6 +133,23 @@ def test_lone_cells_are_cleared():
     np.testing.assert_array_equal(without_lone_cells(jnp.asarray(cleared)), cleared)
 
 
+def test_psf_of_another_distance_on_the_grid_of_one():
+    """Its shadow's size is kept: Fourier sums of it, up to half of the Nyquist frequency."""
+    cells, u = jnp.asarray(drawn() * 1.0), np.linspace(-1, 1, 41) / 0.02
+    own = CellOptics(space(), FAR, 0.005)
+    near = CellOptics(space(), 60.0, 0.005, cells=own.cells)
+    shown = CellOptics(space(), 60.0, 0.005, cells=own.cells, focus=FAR)
+
+    def sums(optics):
+        waves = np.exp(-2j * np.pi * u[:, None] * np.asarray(optics.grid.x))
+        return float(optics.grid.pitch) ** 2 * (waves @ np.asarray(optics(cells)) @ waves.T)
+
+    assert shown.grid.pitch == own.grid.pitch and shown.grid.shape == own.grid.shape
+    size = np.linalg.norm(sums(near))
+    assert np.linalg.norm(sums(shown) - sums(near)) < 0.01 * size
+    assert np.linalg.norm(sums(own) - sums(near)) > 0.25 * size
+
+
 def test_levels():
     numbers = jnp.asarray(np.random.default_rng(2).normal(size=(1, COUNT**2)))
     binary, grey, signs, phases = (

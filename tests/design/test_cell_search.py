@@ -74,7 +74,8 @@ def test_tolerances_are_kept():
             ({"wavelength": 4.9e-4}, {"wavelength": 5.1e-4}),
         ):
             moved = [
-                CellOptics(space().replace(**c), 100.0, 0.04, cells=own.cells) for c in changed
+                CellOptics(space().replace(**c), 100.0, 0.04, cells=own.cells, focus=100.0)
+                for c in changed
             ]
             each = [error([m(design.masks[0].amplitude)], assumed=[psf]) for m in moved]
             total += sum(each) / 2 - error([psf])

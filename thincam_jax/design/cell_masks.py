@@ -136,10 +136,13 @@ class CellOptics(eqx.Module):
     - `grid`: samples of the PSFs.
     - `wave`: factor of the spectrum along an axis; `samples`: number of them in a cell.
     - `split`: parts along a side of each cell, in which amplitudes are given.
+    - `between`: places on the grid's axis where PSFs are taken, if their own magnification is not
+      the grid's.
     """
 
     grid: Grid
     wave: Complex[Array, " f"]
+    between: Float[Array, " x"] | None
     cells: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     split: int = eqx.field(static=True)
@@ -152,14 +155,19 @@ class CellOptics(eqx.Module):
         *,
         cells: int | None = None,
         split: int = 1,
+        focus: float | None = None,
     ):
-        """`cells`: along a side of the window; by default those that the light can reach."""
+        """`cells`: along a side of the window; by default those that the light can reach.
+
+        `focus`: object distance whose grid PSFs are interpolated on; by default their own.
+        """
         cell, distance, wavelength = (
             float(decimal_value(length))
             for length in (masks.cell, masks.distance, masks.wavelength)
         )
         magnification, self.split = 1 + distance / object_distance, split
-        self.samples = 3 * max(1, round(cell * magnification / pitch))
+        shown = magnification if focus is None else 1 + distance / focus
+        self.samples = 3 * max(1, round(cell * shown / pitch))
         reach = wavelength * distance / cell**2 * self.samples / 2  # of the band, cells
         self.cells = cells or fast_shape((math.ceil(masks.count + 2 * _MARGIN * reach), 1))[0]
         total = self.cells * self.samples
@@ -172,11 +180,18 @@ class CellOptics(eqx.Module):
         side = 1.0 if masks.fill_factor is None else float(masks.fill_factor) ** 0.5
         shape = side * part / step * np.sinc(side * part * f)
         self.wave = jnp.asarray(shape * np.exp(-1j * np.pi * f * (path * f - 2 * ahead)))
-        self.grid = Grid((total // 3,) * 2, 3 * step * magnification)
+        self.grid = Grid((total // 3,) * 2, 3 * step * shown)
+        middle, self.between = (total // 3 - 1) / 2, None
+        if shown != magnification:
+            places = (np.arange(total // 3) - middle) * (shown / magnification) + middle
+            self.between = jnp.asarray(places, float)
 
     def __call__(self, amplitude: Float[Array, "y x"] | Complex[Array, "y x"]):
         """Irradiance over that of the open mask, averaged over the grid's cells."""
-        return self.power(self.spectrum(amplitude))
+        power = self.power(self.spectrum(amplitude))
+        if self.between is None:
+            return power
+        return _interpolated(_interpolated(power, self.between).T, self.between).T
 
     def spectrum(self, amplitude: Float[Array, "y x"] | Complex[Array, "y x"]):
         """Spectrum of the wave on the sensor, of cells in `split` parts along a side."""
@@ -197,6 +212,20 @@ class CellOptics(eqx.Module):
         (bins, _), weights = self.grid.shape, jnp.asarray(_BIN, power.dtype)
         parts = power.reshape(bins, 3, bins, 3)
         return jnp.einsum("yaxb,a,b->yx", parts, weights, weights, precision="highest")
+
+
+def _interpolated(rows: Float[Array, "y x"], places: Float[Array, " z"]) -> Float[Array, "z x"]:
+    """Rows at places between them, by the cubics of Catmull and Rom; dark beyond."""
+    x = (places - jnp.floor(places))[:, None].astype(rows.dtype)
+    first = jnp.floor(places).astype(int)
+    weights = (
+        ((2 - x) * x - 1) * x / 2,
+        ((3 * x - 5) * x**2 + 2) / 2,
+        ((4 - 3 * x) * x + 1) * x / 2,
+        (x - 1) * x**2 / 2,
+    )
+    near = [jnp.take(rows, first + n, axis=0, mode="fill", fill_value=0) for n in range(-1, 3)]
+    return sum((w * r for w, r in zip(weights[1:], near[1:], strict=True)), weights[0] * near[0])
 
 
 def drawn_cells(masks: CellMasks, rng: np.random.Generator) -> Bool[np.ndarray, "capture cell"]:

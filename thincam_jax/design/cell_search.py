@@ -253,7 +253,7 @@ class _Problem(eqx.Module):
         grids, distances = [optics.grid] * space.captures, [distance] * space.captures
         error = ExpectedError(setup, grids, distances, nodes=_NODES, padding=_PADDING)
         moved = tuple(
-            CellOptics(one, away, pitch, cells=optics.cells)
+            CellOptics(one, away, pitch, cells=optics.cells, focus=far)
             for one, away in _moved(space, far, tolerances)
         )
         return _Problem(space, optics, error, moved)
