@@ -16,14 +16,12 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
+from tools.photographs import halved, photographs
 
 import thincam_jax as tc
-from thincam_jax.design.cell_masks import CellMasks, CellOptics
-from thincam_jax.design.expected_error import ExpectedError
+from thincam_jax.design.cell_masks import CellMasks
 from thincam_jax.design.limit import limit
-from thincam_jax.design.recommendation import KINDS, recommend
-from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.imaging.targets.images import sample_images
+from thincam_jax.design.recommendation import KINDS, MaskJudge, recommend, zone_plates
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
@@ -140,42 +138,24 @@ figure.savefig(FIGURES / "masks.png", dpi=100)
 # than the thesis' 25 and 21 rad/mm² at 6.5 mm, and how much worse the worst?
 
 
-@jax.jit
-def _of_depths(amplitudes, error, optics):
-    own = jax.lax.map(optics[0], amplitudes)
-    others = [error(jax.lax.map(one, amplitudes), assumed=own) for one in optics[1:]]
-    return sum(others, error(own)) / len(optics)
-
-
-def pair(one, other, away, view, electrons):
+def pair(judge, moved, one, other):
     """Expected error of two pitches, dB."""
-    depths, across, _ = views[view]
-    moved = space.replace(distance=away)
-    focus = CellOptics(moved, far, float(pitch))
-    others = [
-        CellOptics(moved, t, float(pitch), cells=focus.cells, focus=far) for t in depths if t != far
-    ]
-    axis = (np.arange(cells) - (cells - 1) / 2) * float(cell)
-    squared = axis[:, None] ** 2 + axis**2
-    waves = [
-        np.abs(np.cos((beta * squared + phase) / 2))
-        for beta in (one, other)
-        for phase in (0.0, 1.5 * np.pi)
-    ]
-    error = ExpectedError(setup_of(electrons, across), [focus.grid] * 4, [away] * 4, padding=1.25)
-    return 10 * np.log10(float(_of_depths(jnp.asarray(np.stack(waves)), error, [focus, *others])))
+    plates = zone_plates((one, one, other, other), (0.0, 1.5 * np.pi) * 2, moved)
+    return 10 * np.log10(judge(plates))
 
 
 pitches, distances = ((8.0, 15.0, 25.0, 40.0), (3.25, 6.5)) if full else ((25.0,), (6.5,))
 for view in [*views][:2]:
     for electrons in views[view][-1][-2:]:
-        thesis = pair(25.0, 21.0, distance, view, electrons)
-        every = {
-            (one, part * one, away): pair(one, part * one, away, view, electrons) - thesis
-            for one in pitches
-            for part in (0.6, 0.84, 1.0)
-            for away in distances
-        }
+        depths, across, _ = views[view]
+        setup, every = setup_of(electrons, across), {}
+        thesis = pair(MaskJudge(setup, space, depths), space, 25.0, 21.0)
+        for away in distances:
+            moved = space.replace(distance=away)
+            judge = MaskJudge(setup, moved, depths)
+            for one in pitches:
+                for part in (0.6, 0.84, 1.0):
+                    every[one, part * one, away] = pair(judge, moved, one, part * one) - thesis
         least, most = min(every, key=every.get), max(every, key=every.get)
         for name, (one, other, away) in (("best", least), ("worst", most)):
             print(
@@ -191,23 +171,8 @@ for view in [*views][:2]:
 
 sensor, coarse = tc.Sensor((count, count), pitch), tc.Sensor((count // 2,) * 2, 2 * pitch)
 field = 2 * round(whole / far * distance / float(pitch) / 4)
-others = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
-names = [name for name in sample_images() if name not in others][: 8 if full else 2]
 
-
-def photograph(name):
-    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
-    side = min(image.shape)
-    top, left = ((n - side) // 2 for n in image.shape)
-    image = resize(image[top : top + side, left : left + side], (2 * field, 2 * field))
-    return image * 0.4 / image.mean()
-
-
-def halved(images):
-    return images.reshape(*images.shape[:-2], images.shape[-2] // 2, 2, -1, 2).mean((-3, -1))
-
-
-scenes = np.stack([photograph(name) for name in names]).astype(np.float32)
+scenes = photographs(8 if full else 2, (field, field))
 plane = tc.ImagePlane(scenes, far, 2 * field * float(pitch) * far / distance)
 truth = halved(scenes)[..., ::-1, ::-1]
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from tools.photographs import halved, photographs
 
 import thincam_jax as tc
 from thincam_jax.design.cell_masks import CellMasks, CellOptics, without_lone_cells
@@ -23,8 +24,6 @@ from thincam_jax.design.expected_error import ExpectedError
 from thincam_jax.design.objectives import Tolerances
 from thincam_jax.design.phase_mask import mask_of_phase, one_turn
 from thincam_jax.design.relief_files import read_height_map, write_height_map
-from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.lensless.masks.halftone import halftone
 from thincam_jax.lensless.masks.written import as_written
@@ -365,22 +364,7 @@ seen = 8 if full else 2
 sensor, coarse = tc.Sensor((count, count), pitch), tc.Sensor((count // 2,) * 2, 2 * pitch)
 field = 2 * round(across / far * distance / float(pitch) / 4)
 
-
-def photograph(name):
-    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
-    side = min(image.shape)
-    top, left = ((n - side) // 2 for n in image.shape)
-    image = resize(image[top : top + side, left : left + side], (2 * field, 2 * field))
-    return image * 0.4 / image.mean()
-
-
-def halved(images):
-    return images.reshape(*images.shape[:-2], images.shape[-2] // 2, 2, -1, 2).mean((-3, -1))
-
-
-others = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
-names = [name for name in sample_images() if name not in others][:seen]
-scenes = np.stack([photograph(name) for name in names]).astype(np.float32)
+scenes = photographs(seen, (field, field))
 truth = halved(scenes)[..., ::-1, ::-1]
 
 

@@ -19,11 +19,10 @@ import optax
 import scipy.stats
 from jax.scipy.fft import dctn, idctn
 from jax.scipy.sparse.linalg import cg
+from tools.photographs import halved, photographs
 
 import thincam_jax as tc
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
-from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.units import nm
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
@@ -180,22 +179,7 @@ def search(error, draw, steps, electrons):
 # noise. The best linear image knows the crop and the prior. The τ of total variation is 0.3 in
 # plenty of light and 1 in little for all designs, and not tuned for each.
 
-
-def photograph(name):
-    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
-    high, wide = (round(min(np.divide(image.shape, field)) * n) for n in field)
-    top, left = (image.shape[0] - high) // 2, (image.shape[1] - wide) // 2
-    image = resize(image[top : top + high, left : left + wide], (2 * field[0], 2 * field[1]))
-    return image * mean / image.mean()
-
-
-def halved(images):
-    return images.reshape(*images.shape[:-2], images.shape[-2] // 2, 2, -1, 2).mean((-3, -1))
-
-
-others = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
-names = [name for name in sample_images() if name not in others][:seen]
-scenes = np.stack([photograph(name) for name in names]).astype(np.float32)
+scenes = photographs(seen, field, mean)
 truth = halved(scenes)[..., ::-1, ::-1]
 plane = tc.ImagePlane(scenes, 250.0, field[1] * pitch * 250 / distance)
 scene = tc.Scene(plane, source["wavelength"])

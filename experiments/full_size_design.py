@@ -17,14 +17,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
 from PIL import Image
+from tools.photographs import halved, photographs
 
 import thincam_jax as tc
 from thincam_jax.design.cell_masks import CellMasks, CellOptics, drawn_cells
 from thincam_jax.design.cell_search import CellSettings, find_cells
 from thincam_jax.design.expected_error import ExpectedError
 from thincam_jax.design.limit import limit
-from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.imaging.targets.images import sample_images
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
@@ -161,22 +160,7 @@ for name, electrons in lights.items():
 coarse = tc.Sensor((count // 2,) * 2, 2 * pitch)
 field = 2 * round(across / far * distance / float(pitch) / 4)  # of those, centred as they are
 
-
-def photograph(name):
-    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
-    side = min(image.shape)
-    top, left = ((n - side) // 2 for n in image.shape)
-    image = resize(image[top : top + side, left : left + side], (2 * field, 2 * field))
-    return image * 0.4 / image.mean()
-
-
-def halved(images):
-    return images.reshape(*images.shape[:-2], images.shape[-2] // 2, 2, -1, 2).mean((-3, -1))
-
-
-others = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
-names = [name for name in sample_images() if name not in others][:seen]
-scenes = np.stack([photograph(name) for name in names]).astype(np.float32)
+scenes = photographs(seen, (field, field))
 plane = tc.ImagePlane(scenes, far, 2 * field * float(pitch) * far / distance)
 truth = halved(scenes)[..., ::-1, ::-1]
 

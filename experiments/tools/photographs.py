@@ -1,0 +1,28 @@
+"""Photographs for designs: squares or rectangles of one brightness, in twice the field's pixels."""
+
+import numpy as np
+
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.imaging.targets.images import sample_images
+
+# Drawings, and pictures that a design was tuned by.
+_OTHERS = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
+
+
+def photographs(count: int, field: tuple[int, int], mean: float = 0.4) -> np.ndarray:
+    """Light (photograph, 2 y, 2 x) of the first sample images, cut to the field (y, x)."""
+    names = [name for name in sample_images() if name not in _OTHERS][:count]
+    return np.stack([_cut(name, field, mean) for name in names]).astype(np.float32)
+
+
+def _cut(name: str, field: tuple[int, int], mean: float) -> np.ndarray:
+    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
+    high, wide = (round(min(np.divide(image.shape, field)) * n) for n in field)
+    top, left = (image.shape[0] - high) // 2, (image.shape[1] - wide) // 2
+    image = resize(image[top : top + high, left : left + wide], (2 * field[0], 2 * field[1]))
+    return image * mean / image.mean()
+
+
+def halved(images):
+    """Means over 2 × 2 pixels."""
+    return images.reshape(*images.shape[:-2], images.shape[-2] // 2, 2, -1, 2).mean((-3, -1))
