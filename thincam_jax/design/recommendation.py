@@ -5,6 +5,7 @@ same cells and judged by exact diffraction and the error of the best linear imag
 (`ExpectedError`). Several depths count alike, each in an image that is made for the middle one.
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from thincam_jax.design.cell_masks import CellMasks, CellOptics, drawn_cells
 from thincam_jax.design.expected_error import ExpectedError
 from thincam_jax.design.setup import Setup
 from thincam_jax.lensless.masks.cells import ModifiedUniformlyRedundantArray
+from thincam_jax.lensless.masks.phase import relaxed_sites
 from thincam_jax.lensless.masks.sampled import SampledMask
 
 Transmittances = Float[np.ndarray, "capture y x"] | Complex[np.ndarray, "capture y x"]
@@ -126,7 +128,7 @@ def recommend(
     if unknown := [kind for kind in chosen if kind not in KINDS]:
         raise ValueError(f"kinds has {unknown[0]!r}; give some of {', '.join(KINDS)}")
     far = float(decimal_value(setup.object_distance))
-    judge = _Judge.of(setup, space, (far,) if depths is None else tuple(map(float, depths)))
+    judge = MaskJudge(setup, space, (far,) if depths is None else depths)
     found = []
     with watched("comparing masks") as tell:
         for number, kind in enumerate(chosen):
@@ -143,42 +145,47 @@ def recommend(
     return Recommendations(sorted(found, key=lambda one: one.error))
 
 
-class _Judge(eqx.Module):
-    """Expected errors of masks, given by amplitudes of one number of cells.
+class MaskJudge:
+    """Expected errors of masks: a function of the amplitudes of each capture's cells.
 
-    - `middle`: optics of the depth that the image is made for; `others`: those of the others.
+    - `depths`: distances of the scene, mm; the image is made for the middle one. The error is the
+      mean over them.
     """
 
-    middle: CellOptics
-    others: tuple[CellOptics, ...]
-    setup: Setup
-    distance: float = eqx.field(static=True)
-
-    @staticmethod
-    def of(setup: Setup, space: CellMasks, depths: tuple[float, ...]) -> "_Judge":
-        focus = sorted(depths)[len(depths) // 2]
+    def __init__(self, setup: Setup, space: CellMasks, depths: Sequence[float]):
+        every = sorted(map(float, depths))
+        focus = every[len(every) // 2]
         pitch, distance = (float(decimal_value(x)) for x in (setup.pitch, space.distance))
         middle = CellOptics(space, focus, pitch)
-        others = tuple(
-            CellOptics(space, depth, pitch, cells=middle.cells, focus=focus)
-            for depth in sorted(depths)
-            if depth != focus
+        self._optics = (
+            middle,
+            *(
+                CellOptics(space, depth, pitch, cells=middle.cells, focus=focus)
+                for depth in every
+                if depth != focus
+            ),
         )
-        return _Judge(middle, others, setup, distance)
+
+        @functools.cache
+        def error_of(captures: int) -> ExpectedError:
+            grids, distances = [middle.grid] * captures, [distance] * captures
+            return ExpectedError(setup, grids, distances, nodes=_NODES, padding=_PADDING)
+
+        self._error_of = error_of
 
     def __call__(self, amplitudes: Transmittances) -> float:
-        count = len(amplitudes)
-        grids, distances = [self.middle.grid] * count, [self.distance] * count
-        error = ExpectedError(self.setup, grids, distances, nodes=_NODES, padding=_PADDING)
-        return float(_error(self, error, jnp.asarray(amplitudes)))
+        error = self._error_of(len(amplitudes))
+        return float(_mean_error(self._optics, error, jnp.asarray(amplitudes)))
 
 
 @eqx.filter_jit
-def _error(judge: _Judge, error: ExpectedError, amplitudes: Array) -> Float[Array, ""]:
-    """Mean over the depths."""
-    own = jax.lax.map(judge.middle, amplitudes)
+def _mean_error(
+    optics: tuple[CellOptics, ...], error: ExpectedError, amplitudes: Array
+) -> Float[Array, ""]:
+    """Mean over the depths, of images made for the first."""
+    own = jax.lax.map(optics[0], amplitudes)
     every = [error(own)]
-    every += [error(jax.lax.map(optics, amplitudes), assumed=own) for optics in judge.others]
+    every += [error(jax.lax.map(one, amplitudes), assumed=own) for one in optics[1:]]
     return sum(every[1:], start=every[0]) / len(every)
 
 
@@ -235,12 +242,7 @@ def _centres(number: int, space: CellMasks, rng: np.random.Generator) -> np.ndar
     half = float(space.width) / 2
     centres = np.zeros((1, 2)) if number == 1 else rng.uniform(-half, half, (number, 2))
     places = np.stack(np.meshgrid(*2 * [_places(space)[:: max(1, space.count // 64)]]), -1)
-    for _ in range(10 if number > 1 else 0):
-        nearest = KDTree(centres).query(places.reshape(-1, 2))[1]
-        sums = [np.bincount(nearest, x, number) for x in places.reshape(-1, 2).T]
-        counts = np.maximum(np.bincount(nearest, minlength=number), 1)
-        centres = np.stack(sums, -1) / counts[:, None]
-    return centres
+    return relaxed_sites(centres, places.reshape(-1, 2), 10 if number > 1 else 0)
 
 
 def _lens_phase(number: int, space: CellMasks, far: float, rng: np.random.Generator):
@@ -294,7 +296,10 @@ def _rates(space: CellMasks) -> np.ndarray:
     return 2 * np.pi / (3 * float(space.cell) * float(space.width)) * np.geomspace(0.1, 1, 6)
 
 
-def _plates(rates: Iterable[float], phases: Iterable[float], space: CellMasks) -> np.ndarray:
+def zone_plates(
+    rates: Iterable[float], phases: Iterable[float], space: CellMasks
+) -> Float[np.ndarray, "capture y x"]:
+    """Amplitudes of a grey zone plate in each capture, of β in rad/mm² and a phase."""
     squared = _places(space)[:, None] ** 2 + _places(space) ** 2
     each = zip(rates, phases, strict=True)
     return np.stack([np.abs(np.cos((rate * squared + phase) / 2)) for rate, phase in each])
@@ -302,12 +307,12 @@ def _plates(rates: Iterable[float], phases: Iterable[float], space: CellMasks) -
 
 def _zone_apertures(space: CellMasks, far: float, rng: np.random.Generator) -> Members:
     for rate in _rates(space):
-        yield f"β {rate:.1f} rad/mm²", _plates([rate], [0.0], space)
+        yield f"β {rate:.1f} rad/mm²", zone_plates([rate], [0.0], space)
 
 
 def _fringe_scanning(space: CellMasks, far: float, rng: np.random.Generator) -> Members:
     for rate in _rates(space):
-        yield f"β {rate:.1f} rad/mm²", _plates([rate] * 4, np.arange(4) * np.pi / 2, space)
+        yield f"β {rate:.1f} rad/mm²", zone_plates([rate] * 4, np.arange(4) * np.pi / 2, space)
 
 
 def _method_b(space: CellMasks, far: float, rng: np.random.Generator) -> Members:
@@ -315,7 +320,7 @@ def _method_b(space: CellMasks, far: float, rng: np.random.Generator) -> Members
         for ratio in (0.84, 0.6):  # the thesis has 21 beside 25 rad/mm²
             rates = [rate, rate, ratio * rate, ratio * rate]
             label = f"β {rate:.1f} and {ratio * rate:.1f} rad/mm²"
-            yield label, _plates(rates, [0.0, 1.5 * np.pi] * 2, space)
+            yield label, zone_plates(rates, [0.0, 1.5 * np.pi] * 2, space)
 
 
 KINDS: dict[str, Callable[[CellMasks, float, np.random.Generator], Members]] = {

@@ -181,7 +181,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         runs: list[_Run] = []
         try:
             if not warm and _is_slow(problem):
-                self._begin_smooth(recording, problem, images, runs)
+                self._begin_smooth(recording, problem, parts, images, runs)
             else:
                 self._begin(parts, images, "near" if warm else "far", runs)
             for number in range(self.iterations + _FURTHER + 1):
@@ -219,18 +219,24 @@ class PlugAndPlay(AbstractIterativeSolver):
         return reaching_beyond(solve, recording, problem, whole_image, result, self.synthesis)
 
     def _begin(self, parts: list[InverseProblem], images: list[Image], kind: _Kind, runs: list):
-        """Begin the runs of parts, one after the other."""
-        runs.clear()
-        for part, image in zip(parts, images, strict=True):
-            run = _Run(self, part, runs[0].given if runs else None)
+        """Begin the runs of parts, one after the other; anew those that there are."""
+        for number, (part, image) in enumerate(zip(parts, images, strict=True)):
+            is_new = number == len(runs)
+            run = _Run(self, part, runs[0].given if runs else None) if is_new else runs[number]
             run.begin(image, kind)
-            runs.append(run)
+            if is_new:
+                runs.append(run)
 
     def _begin_smooth(
-        self, recording: Recording, problem: InverseProblem, images: list[Image], runs: list["_Run"]
+        self,
+        recording: Recording,
+        problem: InverseProblem,
+        parts: list[InverseProblem],
+        images: list[Image],
+        runs: list["_Run"],
     ):
         """Begin the runs with images by total variation, once more if the noise was another."""
-        parts, mistake, start = _parts(problem), 1.0, None
+        mistake, start = 1.0, None
         for _ in range(2):
             first = AdmmTV(
                 _TAU * mistake,

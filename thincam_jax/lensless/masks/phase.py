@@ -328,17 +328,25 @@ def voronoi_fresnel(
     half = np.array(blank.shape) * float(blank.pitch) / 2
     places = jax.random.uniform(random_key(key), (sites, 2), minval=-1.0, maxval=1.0)
     places = np.asarray(places) * half
-    for _ in range(relaxations):
-        owner = scipy.spatial.KDTree(places).query(cells)[1]
-        count = np.bincount(owner, minlength=sites)[:, None]
-        sums = [np.bincount(owner, cells[:, axis], sites) for axis in (0, 1)]
-        places = np.where(count > 0, np.stack(sums, axis=-1) / np.maximum(count, 1), places)
+    places = relaxed_sites(places, cells, relaxations)
     squared = scipy.spatial.KDTree(places).query(cells)[0].reshape(blank.shape) ** 2
     _require_held(blank, float(np.sqrt(squared.max())), float(focal_length), float(light))
     f = float(focal_length)
     turns = -squared / (np.sqrt(squared + f**2) + f) / float(light)
     turns = jnp.asarray(turns - np.floor(turns), focal_length.dtype)
     return blank.mask(turns * blank.wrap_height(light))
+
+
+def relaxed_sites(
+    sites: Float[np.ndarray, "site 2"], cells: Float[np.ndarray, "cell 2"], steps: int
+) -> Float[np.ndarray, "site 2"]:
+    """Sites moved to the centroids of their cells in steps of Lloyd's relaxation."""
+    for _ in range(steps):
+        owner = scipy.spatial.KDTree(sites).query(cells)[1]
+        count = np.bincount(owner, minlength=len(sites))[:, None]
+        sums = [np.bincount(owner, cells[:, axis], len(sites)) for axis in (0, 1)]
+        sites = np.where(count > 0, np.stack(sums, axis=-1) / np.maximum(count, 1), sites)
+    return sites
 
 
 def _require_held(blank: MaskBlank, reach: float, focal_length: float, wavelength: float) -> None:
