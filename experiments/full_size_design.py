@@ -248,7 +248,8 @@ for ax, title in zip(panels, titles, strict=True):
 panels[0].set(ylabel="y (mm)")
 figure.colorbar(middle, ax=panels[2], label="√ of irradiance, open mask 1")
 figure.savefig(FIGURES / "full-size-mask.png", dpi=100)
-Image.fromarray(np.asarray(mask.amplitude) > 0).save(FIGURES / "full-size-cells.png")
+cells_found = np.uint8(255 * (np.asarray(mask.amplitude) > 0))
+Image.fromarray(cells_found).save(FIGURES / "full-size-cells.png")
 
 # %%
 # How well must it be made?
