@@ -6,6 +6,7 @@ compile (docs/decisions/programs_of_ten.md).
 """
 
 import abc
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -67,6 +68,20 @@ class Outcome(eqx.Module):
     iterations: int
     seconds: float
     reason: str = ""
+
+    def followed_by(self, second: "Outcome") -> "Outcome":
+        """The outcome of a run that went on with this one's image, with both histories.
+
+        A run that counted anew is counted on from this one's iterations.
+        """
+        done = self.iterations - second.history[0].iteration
+        later = (dataclasses.replace(p, iteration=p.iteration + done) for p in second.history[1:])
+        return dataclasses.replace(
+            second,
+            history=(*self.history, *later),
+            iterations=second.iterations + done,
+            seconds=self.seconds + second.seconds,
+        )
 
 
 class AbstractMethod(eqx.Module, Generic[Method_State]):

@@ -18,7 +18,6 @@ from thincam_jax._core.progress import watched
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix
 from thincam_jax.imaging.operators.low_rank import LowRank
-from thincam_jax.reconstruction.assembly import with_equal_planes, without_smooth_misfit
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.coarse import coarsened, finer
 from thincam_jax.reconstruction.cut_psf import with_cut_psfs
@@ -32,8 +31,13 @@ from thincam_jax.reconstruction.other_psf import (
 )
 from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import in_parallel
+from thincam_jax.reconstruction.planes import (
+    with_equal_planes,
+    with_smooth_light,
+    without_smooth_misfit,
+)
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.problem import InverseProblem, with_tau
 from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
@@ -237,11 +241,11 @@ class AbstractRegularised(AbstractIterativeSolver):
         began = time.perf_counter()
         uniform = starts_uniform(recording, problem)
         upright = None if start is None else recording.oriented(start)
-        problem, unit = with_equal_planes(problem)
-        image = first_image(problem, upright, uniform=uniform)
-        if unit is not None:
-            problem = without_smooth_misfit(problem)
-            image = image if upright is None else image * unit
+        whole, unit = with_equal_planes(problem)
+        image = first_image(whole, upright, uniform=uniform)
+        problem = whole if unit is None else without_smooth_misfit(whole)
+        if unit is not None and upright is not None:
+            image = image * unit
         if self.nonnegative:  # it is returned if no iterate is better
             image = jnp.asarray(np.maximum(np.asarray(image), 0))
         if rule:
@@ -255,6 +259,15 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
+        is_still = outcome.status == "converged" or outcome.iterations > _SETTLED
+        if problem is not whole and is_still and _is_settled(outcome):
+            whole = with_tau(whole, problem.tau)
+
+            def minimise(image, iterations):
+                shorter = dataclasses.replace(self, iterations=iterations)
+                return shorter.minimise(whole, image, callback, given=True)
+
+            outcome = with_smooth_light(whole, outcome, minimise, self.iterations)
         found, settled = outcome.image, _is_settled(outcome)
         if unit is not None:
             outcome = dataclasses.replace(outcome, image=found / unit)
@@ -377,7 +390,7 @@ class AdmmTV(AbstractRegularised):
         second = iterate(method, image, schedule, callback=callback)
         if second.status == "iterations_exhausted" and second.iterations < self.iterations:
             third = self._by_admm(problem, second.image, callback, second.iterations)
-            second = _joined(second, third)
+            second = second.followed_by(third)
         is_over = second.status in ("stopped", "interrupted", "non_finite")
         said = "" if is_over else self._negative(problem, coarse, small, first)
         return dataclasses.replace(second, seconds=first.seconds + second.seconds, reason=said)
@@ -406,7 +419,7 @@ class AdmmTV(AbstractRegularised):
             second = self._by_admm(problem, first.image, callback, first.iterations, rough=rough)
         except KeyboardInterrupt:  # before its iterations, which keep their own best image
             return dataclasses.replace(first, status="interrupted")
-        return _joined(first, second)
+        return first.followed_by(second)
 
     def _by_admm(self, problem, image, callback, done: int = 0, *, rough: bool = False) -> Outcome:
         """Outcome from any image."""
@@ -420,12 +433,6 @@ class AdmmTV(AbstractRegularised):
         schedule = Schedule(*limits, adapt_until=until, done=done, **ends)
         method = in_parallel(problem, functools.partial(admm_method, rough=rough))
         return iterate(method, image, schedule, callback=callback)
-
-
-def _joined(first: Outcome, second: Outcome) -> Outcome:
-    """The second run, which went on with the first one's image."""
-    history, seconds = first.history + second.history[1:], first.seconds + second.seconds
-    return dataclasses.replace(second, history=history, seconds=seconds)
 
 
 class Fista(AbstractRegularised):
