@@ -48,8 +48,6 @@ from .plot.page import explore as explore
 from .reconstruction.fringe_filter import FringeScanning as FringeScanning
 from .reconstruction.imaging_model import Cameras as Cameras
 from .reconstruction.imaging_model import Psfs as Psfs
-from .reconstruction.methods import AdmmTV as AdmmTV
-from .reconstruction.methods import Fista as Fista
 from .reconstruction.methods import choose_solver as choose_solver
 from .reconstruction.methods import reconstruct as reconstruct
 from .reconstruction.poisson import PoissonTV as PoissonTV
@@ -57,6 +55,8 @@ from .reconstruction.psf_check import check_psf as check_psf
 from .reconstruction.record import record as record
 from .reconstruction.recording import Recording as Recording
 from .reconstruction.refinement import refine as refine
+from .reconstruction.regularised import AdmmTV as AdmmTV
+from .reconstruction.regularised import Fista as Fista
 from .reconstruction.ridge import Ridge as Ridge
 from .reconstruction.stream import Stream as Stream
 from .reconstruction.wiener import Wiener as Wiener

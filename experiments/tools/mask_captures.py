@@ -18,8 +18,8 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.psf import spectral_psf
-from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation
 from thincam_jax.studies.study import Synthesis, synthesis_matrix

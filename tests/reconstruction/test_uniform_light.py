@@ -13,7 +13,7 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
-from thincam_jax.reconstruction import methods, uniform_light
+from thincam_jax.reconstruction import regularised, uniform_light
 from thincam_jax.reconstruction.problem import objective, residuals
 from thincam_jax.reconstruction.uniform_light import (
     full_windows,
@@ -31,7 +31,7 @@ WIDE = (192, 224)  # pixels of a camera that is biased: an aperture of 224
 @pytest.fixture(autouse=True)
 def all_pixels_at_once(monkeypatch):
     """The first part of the finest pixels, which else begin with an image of coarser ones."""
-    monkeypatch.setattr(methods, "_COARSER", 0)
+    monkeypatch.setattr(regularised, "_COARSER", 0)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import Name, PictureConfig, VariationConfig
 from thincam_jax.reconstruction import AbstractSolver, TotalVariation
-from thincam_jax.reconstruction.methods import AdmmTV
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.ridge import Ridge
 from thincam_jax.studies.pictures import PublishedImage
 

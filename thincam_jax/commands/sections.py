@@ -27,7 +27,7 @@ from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
-from thincam_jax.reconstruction.methods import AdmmTV
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.reconstruction.wiener import Prior, Wiener
 from thincam_jax.studies.study import Method, Published, Synthesis, check_methods

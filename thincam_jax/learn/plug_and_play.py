@@ -33,7 +33,6 @@ from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
 from thincam_jax.learn.residual_noise import ResidualNoise, residual_noise
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
-from thincam_jax.reconstruction.methods import AdmmTV, starts_uniform
 from thincam_jax.reconstruction.normal_equations import (
     INNER_STEPS,
     AbstractNormal,
@@ -55,6 +54,7 @@ from thincam_jax.reconstruction.problem import (
     uniform_image,
 )
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV, starts_uniform
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled_problem import ScaledProblem
 from thincam_jax.reconstruction.solver import (

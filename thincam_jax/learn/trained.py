@@ -46,10 +46,10 @@ from thincam_jax.learn.checkpoint import (
 from thincam_jax.learn.plug_and_play import PlugAndPlay
 from thincam_jax.learn.refocusing.unet import UNet
 from thincam_jax.reconstruction.imaging_model import Psfs
-from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.outside_light import pinned
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one, residuals
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver

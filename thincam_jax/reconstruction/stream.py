@@ -14,9 +14,9 @@ from thincam_jax._core.module import AnyRank
 from thincam_jax.imaging.operators import Stacked
 from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod, State, admm_map
 from thincam_jax.reconstruction.iterate import CHUNK
-from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.splittings import admm_method
 
 

@@ -29,9 +29,10 @@ from thincam_jax.lensless.field import light_over_field, tangents_of
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
-from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
+from thincam_jax.reconstruction.methods import reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.reconstruction.wiener import Wiener

@@ -10,7 +10,7 @@ from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.psf import psf
-from thincam_jax.reconstruction.methods import AdmmTV
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.studies.evaluate import evaluate_method, take
 from thincam_jax.studies.study import Method, Study
 

@@ -20,10 +20,11 @@ from thincam_jax.measured.preparation import Prepared
 from thincam_jax.reconstruction import AbstractSolver, InverseProblem
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Callback, Progress
-from thincam_jax.reconstruction.methods import AbstractRegularised, reconstruct
+from thincam_jax.reconstruction.methods import reconstruct
 from thincam_jax.reconstruction.noise import demosaiced_noise, estimate_variance
 from thincam_jax.reconstruction.problem import relative_residual
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AbstractRegularised
 from thincam_jax.reconstruction.result import Reconstruction
 
 # Real arrays of the window's size that a reconstruction holds at its peak, for each channel.

@@ -18,7 +18,8 @@ from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import AbstractSolver, TotalVariation
 from thincam_jax.reconstruction.depth.refocus import increasing
 from thincam_jax.reconstruction.imaging_model import Cameras
-from thincam_jax.reconstruction.methods import SOLVERS, AdmmTV, Fista
+from thincam_jax.reconstruction.methods import SOLVERS
+from thincam_jax.reconstruction.regularised import AdmmTV, Fista
 from thincam_jax.reconstruction.ridge import Ridge
 from thincam_jax.studies.intervals import Intervals
 from thincam_jax.studies.prepared import computed_psf

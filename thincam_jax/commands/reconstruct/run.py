@@ -31,10 +31,11 @@ from thincam_jax.measured.write import LINEAR, linear_bytes
 from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.reconstruction.depth.find import depth_of_colours
 from thincam_jax.reconstruction.iterate import Progress
-from thincam_jax.reconstruction.methods import AbstractRegularised, choose_solver
+from thincam_jax.reconstruction.methods import choose_solver
 from thincam_jax.reconstruction.other_psf import NEGATIVE, RESIZE, TURN
 from thincam_jax.reconstruction.psf_check import blocks_blur, check_psf
 from thincam_jax.reconstruction.refinement import changed_psf, refine
+from thincam_jax.reconstruction.regularised import AbstractRegularised
 from thincam_jax.studies.prepared import (
     PixelNoise,
     PreparedResult,

@@ -12,9 +12,10 @@ from thincam_jax.imaging.encoding import as_picture
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.measured.bayer import Pattern, colour_sites, demosaic, demosaic_mask
-from thincam_jax.reconstruction.methods import AdmmTV, reconstruct
+from thincam_jax.reconstruction.methods import reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV
 from thincam_jax.reconstruction.result import Reconstruction
 from thincam_jax.reconstruction.wiener import Wiener
 from thincam_jax.studies.evaluate import cameras_of, coupled
