@@ -115,7 +115,7 @@ for combine in ("product", "xor"):
         gap = np.abs(images["product, one term"] - photograph)
         coverage = float(np.mean(gap < 1.96 * sigma))
 recording = tc.Recording(flat, whole.centred().with_modes(), noise_variance=noise**2)
-solver = tc.Ridge(10.0, correlation=8.0 if full else 2.0, tolerance=1e-5)
+solver = tc.Ridge(10.0, correlation=8.0 if full else 2.0)
 result = tc.reconstruct(recording, solver)
 images["xor, all terms"] = result.image
 

@@ -355,7 +355,7 @@ def draw_images(result: Result) -> Figure:
                 result.case(name, scene, electrons, **other),
                 comparison.scenes[scene].image,
             )
-            ax.imshow(align(result.images[case], truth)[0], cmap="gray", vmin=0, vmax=truth.max())
+            ax.imshow(align(result.images[case], truth), cmap="gray", vmin=0, vmax=truth.max())
             ax.set_xlabel(f"{result.scores[case][0]:.1f} dB", fontsize=8, labelpad=1)
     for ax, title in zip(axes[0], ("mask", "PSF", *asked), strict=True):
         ax.set_title(title, fontsize=8)

@@ -326,6 +326,9 @@ def test_the_modes_of_all_terms_precondition_conjugate_gradients():
         quick, slow = (n.solution(right, start, 1e-8, 500) for n in (normal, plain))
         assert relative_l2(normal.applied(quick.value), right) < 1e-6
         assert 3 * int(quick.stats["num_steps"]) < int(slow.stats["num_steps"])
+        seen = (operator(right[:, 0]),)
+        few, many = (n.least_squares(seen, 1e-6, 500)[3] for n in (normal, plain))
+        assert 3 * few < many
 
 
 def test_planes_are_preconditioned_together():

@@ -54,7 +54,8 @@ from thincam_jax.reconstruction.problem import (
 # Of conjugate gradients within an iteration, relative to the right-hand side.
 INNER_TOLERANCE = {"float32": 1e-5, "float64": 1e-10}
 INNER_STEPS = 500
-# Steps between estimates of the error, at least; pixels that are solved sooner without a filter.
+# Steps between estimates of the error, at least; pixels of convolutions that are solved sooner
+# without a filter.
 _SPAN, _FEW = 8, 1024
 # In units of the machine's, of the eigenvalues of convolutions, relative to the largest.
 _ROUNDING = 10
@@ -171,7 +172,7 @@ class IterativeNormal(AbstractNormal):
         problem, shift = self.problem, self.shift
         captures = without_background(problem, captures)
         slope = back_projected(problem, captures)
-        few = math.prod(slope.shape[-3:]) <= _FEW
+        few = self.modes is None and math.prod(slope.shape[-3:]) <= _FEW
         ahead = (not few and self._filter()) or (lambda image: image)
 
         def squares(seen):
