@@ -179,7 +179,8 @@ images = {(kind, name): reconstructed(kind, name) for kind in clean for name in 
 # -------------------------------------------
 #
 # Of one capture: with the axis' convolution, and with the operator over the field, both by the same
-# solver. The operator takes about five convolutions' time.
+# solver, which is told that there is no background. The operator takes about five convolutions'
+# time.
 
 shot = scan_far[0]
 shape = (field, field)
@@ -187,7 +188,7 @@ fit = tc.field_operator(camera(*shot), 500 * nm, object_distance=object_distance
 print(f"{fit.operator.weights.shape[0]} convolutions, error {fit.truncation_error:.1e}")
 alone = tc.Cameras([camera(*shot)], field_shape=shape, **light)
 for name, model in (("TV, axis PSF", alone), ("TV, field operator", [fit.operator])):
-    recording = record("true field", [shot], model)
+    recording = record("true field", [shot], model).with_background(0.0)
     image = np.asarray(tc.reconstruct(recording, tc.Fista(0.5, iterations=iterations)).image)
     upright = image if model is alone else image[:, ::-1, ::-1]  # an operator's image lies turned
     images["true field", name] = upright / (fall if model is alone else 1.0)
@@ -263,7 +264,8 @@ figure.savefig(FIGURES / "images.png", dpi=110)
 #   step of the chart, 12 %: the light at the end of the band is turned by 1.2 rad there, so that
 #   cos 1.2 = 0.4 of it is left. Noise of 30 dB weighs more.
 # - One capture with total variation gains 0.8 dB in the middle from the operator over the field,
-#   where the light of all points falls, and nothing at the edge.
+#   where the light of all points falls, and nothing at the edge. With a background to find, 200
+#   iterations come farther with the axis' PSF, 22.8 dB, and as far with the operator, 21.9 dB.
 
 rings = {name: values for (kind, name), values in quality.items() if kind == "true field"}
 quoted = {

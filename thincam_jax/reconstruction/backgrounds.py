@@ -47,11 +47,11 @@ def shows_brightness(
     operators: Sequence[AbstractOperator], uniform: Float[Array, "1 1 1 1"]
 ) -> list[Bool[Array, ""]]:
     """Whether the capture of a `uniform` image is not uniform, of each operator."""
-    shown = []
-    for operator in operators:
-        flat = forward(operator, uniform)
-        shown.append(jnp.var(flat) > UNEVEN * jnp.mean(flat**2))
-    return shown
+    return [_is_uneven(forward(operator, uniform)) for operator in operators]
+
+
+def _is_uneven(flat: Float[Array, "..."]) -> Bool[Array, ""]:
+    return jnp.var(flat) > UNEVEN * jnp.mean(flat**2)
 
 
 @quickly_compiled
@@ -60,16 +60,21 @@ def light_of_uniform(
     captures: Sequence[Float[Array, "*batch y x"]],
     weights: Sequence[Float[Array, "..."] | Bool[Array, "..."]],
 ) -> list[Float[Array, ""]]:
-    """Correlation of each capture with that of a uniform image, both without their means."""
+    """Correlation of each capture with that of a uniform image, both without their means.
+
+    It is 0 where a uniform image casts a uniform capture.
+    """
     found = []
     for operator, capture, weight in zip(operators, captures, weights, strict=True):
         weight = jnp.broadcast_to(weight, capture.shape).astype(capture.dtype)
         flat = forward(operator, jnp.ones((1,) * 4, capture.dtype))
+        shown = _is_uneven(flat)
         colours = (n for n in flat.shape[:-2] if n > 1)
         flat = jnp.broadcast_to(flat.reshape(*colours, *flat.shape[-2:]), capture.shape)
         flat, light = (one - weighted_mean(weight, one, 2) for one in (flat, capture))
         size = jnp.sum(weight * flat**2) * jnp.sum(weight * light**2)
-        found.append(jnp.sum(weight * flat * light) / jnp.sqrt(or_one(size)))
+        both = jnp.sum(weight * flat * light) / jnp.sqrt(or_one(size))
+        found.append(jnp.where(shown, both, 0))
     return found
 
 

@@ -99,7 +99,7 @@ _ENOUGH = 1 << 16  # details, of larger captures
 _MEDIAN = 0.6745  # of |x|, if x is normal with standard deviation 1
 # Part of a capture's pixels that may be negative anyway, and the greatest root mean square of
 # negative pixels by noise, in σ: it is 1 where the scene is black, 0.82 where it darkens evenly.
-_NEGATIVE, _BY_NOISE = 0.01, 1.4
+_NEGATIVE, BY_NOISE = 0.01, 1.4
 
 
 @jax.jit
@@ -269,16 +269,12 @@ def _variances(deviations, captures):
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))
 
 
-def is_below_black(capture: Float[Array, "*batch y x"], *, by_noise: bool) -> bool:
-    """Whether over 1 % of a known capture's pixels are negative.
-
-    - `by_noise`: whether noise around black is no reason.
-    """
-    below = np.asarray(capture) < 0
-    if np.mean(below) <= _NEGATIVE or not by_noise:
-        return bool(np.mean(below) > _NEGATIVE)
-    deviation = jnp.sqrt(jnp.mean(estimate_noise(capture) ** 2))
-    return bool(jnp.sqrt(jnp.mean(capture**2, where=below)) > _BY_NOISE * deviation)
+def square_below_black(capture: Float[Array, "*batch y x"]) -> float:
+    """Mean square of a known capture's negative pixels, 0 where they are 1 % or fewer."""
+    light = np.asarray(capture)
+    below = light[light < 0]
+    is_dark = below.size > _NEGATIVE * light.size
+    return float(np.mean(np.square(below, dtype=np.float64))) if is_dark else 0.0
 
 
 def given_variances(

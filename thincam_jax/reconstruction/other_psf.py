@@ -19,7 +19,7 @@ from thincam_jax._core.checks import holds_traced
 from thincam_jax.reconstruction.backgrounds import light_of_uniform, with_other_background
 from thincam_jax.reconstruction.coarse import coarsened, finer
 from thincam_jax.reconstruction.iterate import Outcome
-from thincam_jax.reconstruction.problem import InverseProblem, convolutions
+from thincam_jax.reconstruction.problem import InverseProblem, convolutions, detector_shape
 from thincam_jax.reconstruction.psf_check import scaled_psf
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
@@ -110,7 +110,9 @@ def negative_behind_operators(recording: Recording) -> str:
     looked at with PSFs, and where a uniform scene casts a uniform capture.
     """
     operators = getattr(recording.imaging_model, "operators", ())
-    if not operators or not recording.shows_brightness or holds_traced(recording.captures):
+    if not operators or holds_traced((operators, recording.captures)):
+        return ""
+    if any(len(detector_shape(operator)) != 2 for operator in operators):
         return ""
     weights = [jnp.ones(()) if m is None else m for m in recording.valid or [None] * len(operators)]
     found = jax.device_get(light_of_uniform(operators, recording.light, weights))

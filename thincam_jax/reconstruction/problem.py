@@ -347,15 +347,10 @@ def uniform_level(
     return jnp.where(light > 0, seen / jnp.where(light > 0, light, 1), 0)
 
 
-def scene_level(
-    problem: InverseProblem, *, is_bounded: bool = False
-) -> Float[Array, "*batch channel"]:
-    """The uniform brightness of the scene: a background that is not negative takes none away.
-
-    - `is_bounded`: whether it is not, though the problem, a linear one, does not say so.
-    """
+def scene_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
+    """The uniform brightness of the scene: a background that is not negative takes none away."""
     level = uniform_level(problem)
-    if not (is_bounded or problem.background == "nonnegative"):
+    if problem.background != "nonnegative":
         return level
     return jnp.minimum(level, uniform_level(problem, has_background=False))
 

@@ -1,8 +1,9 @@
 """Recordings: captures with their imaging model and noise."""
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -25,9 +26,10 @@ from thincam_jax.reconstruction.backgrounds import shows_brightness
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.noise import (
+    BY_NOISE,
     estimate_variance,
     given_variances,
-    is_below_black,
+    square_below_black,
     valid_pixels,
     without_unknown,
 )
@@ -154,16 +156,19 @@ class Recording(Module):
           converge much faster.
         """
         captures, valid = self._masked_captures()
+        estimated = functools.cache(functools.partial(self._estimated, captures, valid))
+        noise = self._variances(captures, estimated)
+        below = functools.partial(self._is_below_black, captures, noise, estimated)
         settings = {
             "tau": tau,
             "regulariser": regulariser,
             "nonnegative": nonnegative,
-            "background": self._kind_of_background(captures, synthesis, nonnegative),
+            "background": self._kind_of_background(synthesis, nonnegative, below),
         }
         operators = self._operators()
         if operators:
             _no_synthesis(synthesis, "operators")
-            variances = self._variances(np.eye(len(captures)), captures, valid)
+            variances = _sums(np.eye(len(captures), dtype=noise.dtype), noise)
             lengths = [len(detector_shape(o)) for o in operators]
             captures = [with_channel(c, n) for c, n in zip(captures, lengths, strict=True)]
             weights = [
@@ -172,10 +177,8 @@ class Recording(Module):
             ]
             return InverseProblem(operators, captures, weights=weights, **settings)
         matrix, channels = self._channels(synthesis, captures, valid)
-        variances = [
-            variance * c.ratio**2
-            for variance, c in zip(self._variances(matrix, captures, valid), channels, strict=True)
-        ]
+        summed = _sums(np.asarray(matrix**2, noise.dtype), noise)
+        variances = [v * c.ratio**2 for v, c in zip(summed, channels, strict=True)]
         pitch = self._pitch(captures[0].dtype)
         return convolution_problem(channels, variances, pitch, self._field(), settings)
 
@@ -328,19 +331,34 @@ class Recording(Module):
             )
         return tuple(each)
 
-    def _kind_of_background(self, captures, synthesis: Any, nonnegative: bool) -> Background:
+    def _kind_of_background(
+        self, synthesis: Any, nonnegative: bool, is_below_black: Callable[[], bool]
+    ) -> Background:
         """Not negative but in differences of captures, and if something was subtracted before."""
         if self.background is not None or not self.shows_brightness:
             return "known"
         if not nonnegative or (synthesis is not None and bool(np.any(np.asarray(synthesis) < 0))):
             return "unknown"
-        # Where it leaves the brightness open, a negative background is far worse than none.
+        return "unknown" if is_below_black() else "nonnegative"
+
+    def _is_below_black(self, captures, noise, estimated: Callable[[], Array]) -> bool:
+        """Whether captures that are known are negative.
+
+        By more than noise where they leave the brightness open: a negative background is far worse
+        than none there. The noise is the lower of that given and that estimated.
+        """
+        if checks.holds_traced(captures):
+            return False
+        squares = np.array([square_below_black(capture) for capture in captures])
         model = self.imaging_model
         is_open = not isinstance(model, Cameras) and getattr(model, "field_shape", None) is None
-        known = [c for c in captures if not checks.is_traced(c)]
-        with jax.ensure_compile_time_eval():  # captures that are known stay so under jit
-            below = any(is_below_black(c, by_noise=is_open) for c in known)
-        return "unknown" if below else "nonnegative"
+        if not is_open or not squares.any():
+            return bool(squares.any())
+        given = [] if checks.is_traced(noise) else [lambda: noise]
+        return any(
+            bool(np.any(squares > BY_NOISE**2 * np.asarray(variance())))
+            for variance in (*given, estimated)
+        )
 
     @property
     def shows_brightness(self) -> bool:
@@ -356,12 +374,6 @@ class Recording(Module):
         with jax.ensure_compile_time_eval():  # operators that are known stay so under jit
             uniform = jnp.ones((1,) * 4, self.captures[0].dtype)
             return bool(np.all(jax.device_get(shows_brightness(operators, uniform))))
-
-    @property
-    def is_above_black(self) -> bool:
-        """Whether a background to find is not negative."""
-        captures, _ = self._masked_captures()
-        return self._kind_of_background(captures, None, nonnegative=True) == "nonnegative"
 
     @property
     def light(self) -> tuple[Float[Array, "..."], ...]:
@@ -396,27 +408,23 @@ class Recording(Module):
         light = [checks.staying_known(_without_invalid, *pair) for pair in pairs]
         return light, [m for _, m in pairs]
 
-    def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
-        """Variances of sums of captures: as given, or estimated where none or zero is given."""
-
-        def sums(each: Float[Array, " capture"]) -> list[Float[Array, ""]]:
-            return _sums(np.asarray(matrix**2, each.dtype), each)
-
+    def _variances(self, captures, estimated: Callable[[], Array]) -> Float[Array, " capture"]:
+        """Variance of each capture: as given, or estimated where none or zero is given."""
         if self.noise_variance is None:
-            return sums(self._estimated(captures, valid))
+            return estimated()
         with jax.ensure_compile_time_eval():  # a variance that is known stays so under jit
-            totals = sums(given_variances(self.noise_variance, captures))
-        if all(not checks.is_traced(total) and float(total) > 0 for total in totals):
-            return totals
-        found = sums(self._estimated(captures, valid))
-        return [jnp.where(t > 0, t, f) for t, f in zip(totals, found, strict=True)]
+            given = given_variances(self.noise_variance, captures)
+        if not checks.is_traced(given) and np.all(np.asarray(given) > 0):
+            return given
+        return jnp.where(given > 0, given, estimated())
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:
         given = getattr(self.imaging_model, "operators", ())
         if any(len(s) < 2 for one in given for s in shapes_of(one.out_shape)):
             raise ValueError("give noise_variance: it is estimated from captures that are images")
-        found = estimate_variance(captures, None if valid[0] is None else valid)
-        return unseen_variance(given, captures, valid, found)
+        with jax.ensure_compile_time_eval():  # captures that are known stay so under jit
+            found = estimate_variance(captures, None if valid[0] is None else valid)
+            return unseen_variance(given, captures, valid, found)
 
     def _pitch(self, dtype) -> Float[Array, ""]:
         if isinstance(self.imaging_model, Cameras):

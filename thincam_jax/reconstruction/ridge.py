@@ -51,6 +51,7 @@ from thincam_jax._core.precision import product
 from thincam_jax._core.quantity import FieldError, quantity, whole
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.imaging.operators.separable import SeparableModes
+from thincam_jax.reconstruction.backgrounds import with_other_background
 from thincam_jax.reconstruction.closed_normal import AbstractNormal, LevelledNormal, SeparableNormal
 from thincam_jax.reconstruction.iterate import Outcome, outcome_of_run
 from thincam_jax.reconstruction.normal_equations import IterativeNormal, normal_equations
@@ -190,12 +191,13 @@ class Ridge(AbstractSolver):
 
     def _posed(self, recording):
         """The problem, the whitened problem, the mean, the prior and ρ."""
-        problem = recording.problem(nonnegative=False, synthesis=self.synthesis)
         # Sums in which the uniform light cancels do not show how bright the scene is; captures do.
-        level, mean = _uniform(
-            problem if self.synthesis is None else recording.problem(nonnegative=False),
-            is_bounded=recording.is_above_black,
-        )
+        problem = recording.problem()
+        level, mean = _uniform(problem)
+        if self.synthesis is not None:
+            problem = recording.problem(synthesis=self.synthesis)
+        if problem.has_background:  # a linear method has no limits
+            problem = with_other_background(problem, "unknown")
         given = 1.0 if isinstance(self.ridge, str) else self.ridge * image_precision(level)
         tried = []
         for correlation in self.correlation:
@@ -209,10 +211,10 @@ class Ridge(AbstractSolver):
         return min(tried, key=operator.itemgetter(0))[1]
 
 
-@functools.partial(jax.jit, static_argnames="is_bounded")
-def _uniform(problem: InverseProblem, *, is_bounded: bool):
+@jax.jit
+def _uniform(problem: InverseProblem):
     """Level of the uniform image, and that image, not negative."""
-    level = scene_level(problem, is_bounded=is_bounded)
+    level = scene_level(problem)
     level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
     return level, jnp.maximum(level, 0)[..., None, None, None]
 
