@@ -16,8 +16,7 @@ from benchmarks.test_flatcam import CHANNELS, FIELD, RHO, codes
 from thincam_jax.imaging.operators import CropConvolution, Separable
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.method import PsfMethod, pixel_nodes
 from thincam_jax.lensless.psf import _psf
 from thincam_jax.reconstruction import ridge as ridge_module
 from thincam_jax.reconstruction.ridge import ridge_by_modes

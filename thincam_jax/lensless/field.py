@@ -21,8 +21,7 @@ from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import ERROR_PER_RADIAN, LenslessCamera, shift_variance
 from thincam_jax.lensless.masks.base import has_few_terms, zone_orders
-from thincam_jax.lensless.method import Model, PsfMethod, as_method
-from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes
+from thincam_jax.lensless.method import Model, PsfMethod, as_method, average_error, pixel_nodes
 from thincam_jax.lensless.psf import spectral_psf
 
 

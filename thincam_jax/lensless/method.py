@@ -45,6 +45,16 @@ CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMP
 # of the far edge turn by up to 10 cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000
 # of the amplitude: 8 nodes are 2e-3 off there, 16 8e-5, 24 1e-10.
 PIXEL_NODES = 24
+# Fewer nodes, and the fringes a pixel up to which their averages are exact to
+# 1e-7 and 1e-13.
+_FEWER: dict[Precision, dict[int, float]] = {
+    "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
+    "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},
+}
+# More nodes, and how many more than half of π times the fringes they must be to follow these. At
+# their end what they leave of a PSF, times their count and the root of the mask's width in pixels:
+# an edge is in so many pixels.
+_MORE, _BEYOND, _LEFT = (PIXEL_NODES, 32, 48, 64, 96, 128, 192, 320), 9.0, 1.25
 # Points a pixel for its average then: 1 to 4 % off where a pixel holds some ten fringes.
 LATTICE_POINTS = 21
 # Samples in the mean of a cell and of an edge's zone, and samples a pixel where they are not known.
@@ -251,3 +261,52 @@ def _mask_plane(mask: AbstractMask, grid: Grid) -> tuple[int, int] | None:
     reach = (np.array([height, width]) + 2 * np.abs(centre)) / pitch
     rows, columns = (max(1, math.ceil(r - 1e-4)) for r in reach)
     return rows, columns
+
+
+def pixel_nodes(
+    mask: AbstractMask, grid: Grid, path: LightPath, precision: Precision, tolerance: float = 0.0
+) -> int:
+    """Nodes that the pixel average needs; `PIXEL_NODES` while the numbers are traced.
+
+    As many as follow its fringes, at most 320, or fewer that leave the tolerance.
+    """
+    known = _fringes(mask, grid, path)
+    if known is None:
+        return PIXEL_NODES
+    fringes, left = known
+    few = [n for n, most in _FEWER[precision].items() if fringes <= most]
+    few += [n for n in _MORE if _follow(n, fringes) or left <= tolerance * n]
+    return next(iter(few), _MORE[-1])
+
+
+def with_nodes(method: PsfMethod, mask: AbstractMask, grid: Grid, path: LightPath) -> PsfMethod:
+    """The settings with the nodes that the average of "separable" needs, unless it has some."""
+    if method.model != "separable" or not method.pixel_integration or method.nodes is not None:
+        return method
+    nodes = pixel_nodes(mask, grid, path, method.float_type, method.averages_tolerance)
+    return replace(method, nodes=nodes)
+
+
+def average_error(mask: AbstractMask, grid: Grid, path: LightPath, nodes: int) -> float:
+    """Relative error of the PSF, of nodes that do not follow the fringes; 0 of others."""
+    known = _fringes(mask, grid, path)
+    return 0.0 if known is None or _follow(nodes, known[0]) else known[1] / nodes
+
+
+def _follow(nodes: int, fringes: float) -> bool:
+    few = _FEWER["float32"].get(nodes, 0.0)
+    return fringes <= few or nodes >= fringes * math.pi / 2 + _BEYOND
+
+
+def _fringes(mask: AbstractMask, grid: Grid, path: LightPath) -> tuple[float, float] | None:
+    """Fringes a pixel and the error of one node; None while the numbers are traced.
+
+    The band of the irradiance ends at width/(λd): so many fringes there are at most.
+    """
+    numbers = (*mask.extent, grid.pitch, path.wavelength, path.distance)
+    if checks.holds_traced(numbers):
+        return None
+    # In NumPy: inside jit, JAX would trace the product of known numbers too.
+    height, width, pitch, wavelength, distance = map(float, map(np.asarray, numbers))
+    fringes = pitch * max(height, width) / (wavelength * distance)
+    return fringes, _LEFT * math.sqrt(pitch / min(height, width))

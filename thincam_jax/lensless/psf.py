@@ -3,7 +3,7 @@
 import functools
 import math
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -39,8 +39,10 @@ from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommer
 from thincam_jax.lensless.propagation.separable import (
     SeparableSum,
     centre_phase,
+    image_of_terms,
     separable,
     separable_image,
+    transform_of_terms,
 )
 from thincam_jax.lensless.propagation.skew import skew_image
 from thincam_jax.lensless.resolve import resolve
@@ -100,7 +102,7 @@ def psf(
 
     **See also**: `otf`, `choose_model`, `capture`.
     """
-    return _computed(_psf, camera, (wavelength, object_distance, at), model, pixel_integration)
+    return _computed(_PSF, camera, (wavelength, object_distance, at), model, pixel_integration)
 
 
 def psf_about_ray(
@@ -112,7 +114,7 @@ def psf_about_ray(
 ) -> Float[Array, "y x"]:
     """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
     light = wavelength, object_distance, at
-    return _computed(_psf, camera, light, method, follows=at is not None)
+    return _computed(_PSF, camera, light, method, follows=at is not None)
 
 
 def spectral_psf(
@@ -162,7 +164,7 @@ def otf(
 
     **See also**: `psf`, `lensless.phase_shift.fringe_scanned_otf`.
     """
-    return _computed(_otf, camera, (wavelength, object_distance, at), model, pixel_integration)
+    return _computed(_OTF, camera, (wavelength, object_distance, at), model, pixel_integration)
 
 
 @checked
@@ -207,7 +209,7 @@ def mtf(
     if not checks.holds_traced(rho, grid.pitch):
         most = (0.5 + 1e-6) / float(grid.pitch)  # but for rounding
         checks.between("max(frequencies)", jnp.max(jnp.abs(rho)), "cycles/mm", 0.0, most)
-    h = _computed(_psf, camera, (wavelength, object_distance), model, pixel_integration)
+    h = _computed(_PSF, camera, (wavelength, object_distance), model, pixel_integration)
     return _contrast(h, grid, rho)
 
 
@@ -224,15 +226,9 @@ def _contrast(h: Float[Array, "y x"], grid: Grid, rho: Float[Array, " n"]) -> Fl
 
 
 def _irradiance(
-    mask: AbstractMask | SeparableSum, grid: Grid, path: Any, method: Any
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
-    """The PSF in the form in which the model has it: terms where there are terms, else an image.
-
-    In place of a mask, its terms on the grid and beyond it.
-    """
-    if isinstance(mask, SeparableSum):
-        rows, columns = grid.shape
-        return SeparableSum(mask.rows[:, :rows], mask.columns[:, :columns], grid)
+    """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
         nodes = method.nodes if method.pixel_integration else None
@@ -293,8 +289,12 @@ def _otf(mask, grid: Grid, path, method):
     return spectrum * rows[:, None] * columns
 
 
+# Of any model, and of known terms.
+_PSF, _OTF = (_psf, image_of_terms), (_otf, transform_of_terms)
+
+
 def _computed(
-    function,
+    functions: tuple[Callable[..., Any], Callable[..., Any]],
     camera: LenslessCamera,
     light: tuple[Any, ...],
     model: Model | PsfMethod,
@@ -302,31 +302,33 @@ def _computed(
     *,
     follows: bool = False,
 ):
-    """`function` of what `resolve` gives for the path of light, in the camera's precision."""
+    """A function of what `resolve` gives for the path of light, in the camera's precision."""
     path = camera.path(*light)
     path = replace(path, follows=True) if follows else path
     if path.at is None and path.place is not None and as_method(model).model in SAMPLED:
         path = replace(path, at=jnp.zeros_like(path.place))  # these follow the ray
     mask, grid, path, method = resolve(camera, path, model, pixel_integration)
-    own = precision_of(camera.sensor.pitch)
+    own, (of_mask, of_terms) = precision_of(camera.sensor.pitch), functions
     with allow(method.precision or own, mask, grid, path), watched("computing the PSF"):
-        result = function(*_with_terms(mask, grid, path, method))
+        terms = _known_terms(mask, grid, path, method)
+        result = of_mask(mask, grid, path, method) if terms is None else of_terms(terms, grid)
     return result if method.precision == own else cast(result, own)
 
 
-def _with_terms(mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod) -> Any:
-    """Known numbers with the terms of a closed form in place of the mask, as `_irradiance` takes.
+def _known_terms(
+    mask: AbstractMask, grid: Grid, path: LightPath, method: PsfMethod
+) -> SeparableSum | None:
+    """Terms of the closed form of known numbers, on samples that go on beyond the grid.
 
     All grids of up to as many samples share their program, which takes a second to compile.
     """
     closed = method.model == "separable" and not path.skew and has_few_terms(mask)
     if not closed or checks.holds_traced(mask, grid, path):
-        return mask, grid, path, method
+        return None
     most = max(grid.shape)
     count = _FEW if most <= _FEW else _STEP * math.ceil(most / _STEP)
     rows, columns = (np.arange(count) - (n - 1) / 2 for n in grid.shape)
-    places = SparseGrid(rows, columns, grid.pitch)
-    return closed_terms(mask, places, path, method), grid, None, None
+    return closed_terms(mask, SparseGrid(rows, columns, grid.pitch), path, method)
 
 
 def _unfocused(mask: AbstractMask, path: LightPath) -> AbstractMask:

@@ -38,10 +38,10 @@ from thincam_jax.lensless.method import (
     odd_from,
     psf_method,
     sampled_off_axis,
+    with_nodes,
 )
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 from thincam_jax.lensless.propagation.radial import profile_length, profile_samples
-from thincam_jax.lensless.propagation.separable import with_nodes
 
 
 class SamplingWarning(UserWarning):
@@ -240,16 +240,16 @@ def held_in_single(mask: AbstractMask, grid: Grid, path: LightPath, model: str) 
 
 def largest_phase(mask: Any, grid: Grid, path: LightPath, model: str) -> float:
     """Largest phase, rad, of the orders' fringes where they are strong and light falls."""
+    beta, halves, orders = float(mask.beta), [float(n) / 2 for n in mask.extent], mask.orders
     with jax.ensure_compile_time_eval():  # inside jit, sums of known numbers are traced as well
         scale, epsilon = map(float, _scale_and_epsilon(path, mask.beta))
     epsilon = 0.0 if model == "geometric" else epsilon
-    beta, halves = float(mask.beta), [float(side) / 2 for side in mask.extent]
     ends = [
         (n - 1) / 2 * float(grid.pitch) / scale + abs(float(c))
         for n, c in zip(grid.shape, np.asarray(mask.centre), strict=True)
     ]
     found = 0.0
-    for k in mask.orders:
+    for k in orders:
         if model == "paraxial":  # its phases are those of kβ(1 − kε), which grow with k²ε
             found = max(found, abs(k) * beta * abs(1 - k * epsilon) * sum(r**2 for r in ends))
         gain = abs(1 + k * epsilon)
@@ -388,9 +388,9 @@ def resolve(
     mask, grid = camera.mask, camera.sensor.grid
     given = method = as_method(model, pixel_integration)
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
+    method = with_nodes(method, mask, grid, path)
     require_phase_sampling(mask, grid, path, method)
     require_off_axis(mask, path, method.model)
-    method = with_nodes(method, mask, grid, path)
     if method.model == "radial" and method.oversampling is None:
         method = replace(method, oversampling=profile_samples(mask, grid, path, method))
     with allow(method.float_type, mask, grid, path):

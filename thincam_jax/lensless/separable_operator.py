@@ -16,8 +16,7 @@ from thincam_jax.imaging.operators.separable import Truncated, orthogonal_terms
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
-from thincam_jax.lensless.method import Model, PsfMethod, psf_method
-from thincam_jax.lensless.propagation.separable import with_nodes
+from thincam_jax.lensless.method import Model, PsfMethod, psf_method, with_nodes
 from thincam_jax.lensless.psf import closed_terms
 
 # Terms below this part of all are those of other terms again: rounding.

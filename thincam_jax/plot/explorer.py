@@ -30,9 +30,8 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.base import has_few_terms
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod, pixel_nodes
 from thincam_jax.lensless.phase_shift import fringe_scanned_otf, with_phase, without_carrier
-from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.methods import reconstruct

@@ -12,8 +12,8 @@ from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.lensless.method import PIXEL_NODES
-from thincam_jax.lensless.propagation.separable import average_error, pixel_nodes, separable
+from thincam_jax.lensless.method import PIXEL_NODES, average_error, pixel_nodes
+from thincam_jax.lensless.propagation.separable import separable
 
 INF = float("inf")
 THESIS = {"beta": 25.0, "width": 5.632, "distance": 6.5, "wavelength": 500e-6}

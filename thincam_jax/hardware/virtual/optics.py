@@ -26,9 +26,10 @@ from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.sampled import SampledMask
+from thincam_jax.lensless.method import pixel_nodes
 from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
+from thincam_jax.lensless.propagation.separable import SeparableSum
 from thincam_jax.measured.bayer import Pattern, mosaic
 from thincam_jax.measured.calibration.alignment import to_indices
 

@@ -31,7 +31,7 @@ from thincam_jax._core.precision import (
 )
 from thincam_jax.lensless.camera import LightPath
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
-from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod, pixel_nodes
 from thincam_jax.lensless.propagation.angular_spectrum import (
     lit_mask,
     padded_shape,
@@ -41,7 +41,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
 )
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
-from thincam_jax.lensless.propagation.separable import SeparableSum, pixel_nodes
+from thincam_jax.lensless.propagation.separable import SeparableSum
 from thincam_jax.lensless.psf import closed_terms
 
 # Rows and columns that are looked at. All sizes have this many, so that nothing recompiles.

@@ -30,8 +30,8 @@ from thincam_jax.lensless.method import (
     PsfMethod,
     models_of,
     psf_method,
+    with_nodes,
 )
-from thincam_jax.lensless.propagation.separable import with_nodes
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
 from thincam_jax.lensless.resolve import (
     Cost,

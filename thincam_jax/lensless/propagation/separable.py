@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -11,18 +10,11 @@ import numpy as np
 from jaxtyping import Array, Complex, DTypeLike, Float
 from numpy.polynomial.legendre import leggauss
 
-from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import Precision, as_complex, product, turn_phasor
+from thincam_jax._core.precision import as_complex, product, turn_phasor
 from thincam_jax.lensless.camera import LightPath
-from thincam_jax.lensless.masks.base import (
-    AbstractFactoredMask,
-    AbstractMask,
-    AxisFactors,
-    MaskTerms,
-    pairs,
-)
-from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms, pairs
+from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
 
 
@@ -62,6 +54,23 @@ class SeparableSum(eqx.Module):
         return rows, jnp.concatenate([self.columns.real, self.columns.imag])
 
 
+@jax.jit
+def image_of_terms(terms: SeparableSum, grid: Grid) -> Float[Array, "y x"]:
+    """The image on a grid of terms on its rows and columns and beyond."""
+    return _cut(terms, grid).image()
+
+
+@jax.jit
+def transform_of_terms(terms: SeparableSum, grid: Grid) -> Complex[Array, "v u"]:
+    """The transform of `image_of_terms`."""
+    return _cut(terms, grid).transform()
+
+
+def _cut(terms: SeparableSum, grid: Grid) -> SeparableSum:
+    rows, columns = grid.shape
+    return SeparableSum(terms.rows[:, :rows], terms.columns[:, :columns], grid)
+
+
 def _centred_dft(samples: Float[Array, "factor n"]) -> Complex[Array, "factor n"]:
     """Σ_i f_i e^{−2πj u (i−(n−1)/2)}, zero frequency at n//2."""
     n = samples.shape[-1]
@@ -75,67 +84,8 @@ def centre_phase(count: int, dtype: DTypeLike) -> Complex[Array, " count"]:
     return turn_phasor(turns)
 
 
-# Nodes fewer than `PIXEL_NODES`, and the fringes a pixel up to which their averages are exact to
-# 1e-7 and 1e-13.
-_FEWER: dict[Precision, dict[int, float]] = {
-    "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
-    "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},
-}
-# More nodes, and how many more than half of π times the fringes they must be to follow these. At
-# their end what they leave of a PSF, times their count and the root of the mask's width in pixels:
-# an edge is in so many pixels.
-_MORE, _BEYOND, _LEFT = (PIXEL_NODES, 32, 48, 64, 96, 128, 192, 320), 9.0, 1.25
 # Rows and columns up to which a core computes both as fast as two.
 _SMALL = 1024
-
-
-def pixel_nodes(
-    mask: AbstractMask, grid: Grid, path: LightPath, precision: Precision, tolerance: float = 0.0
-) -> int:
-    """Nodes that the pixel average needs; `PIXEL_NODES` while the numbers are traced.
-
-    As many as follow its fringes, at most 320, or fewer that leave the tolerance.
-    """
-    known = _fringes(mask, grid, path)
-    if known is None:
-        return PIXEL_NODES
-    fringes, left = known
-    few = [n for n, most in _FEWER[precision].items() if fringes <= most]
-    few += [n for n in _MORE if _follow(n, fringes) or left <= tolerance * n]
-    return next(iter(few), _MORE[-1])
-
-
-def with_nodes(method: PsfMethod, mask: AbstractMask, grid: Grid, path: LightPath) -> PsfMethod:
-    """The settings with the nodes that the average of "separable" needs, unless it has some."""
-    if method.model != "separable" or not method.pixel_integration or method.nodes is not None:
-        return method
-    nodes = pixel_nodes(mask, grid, path, method.float_type, method.averages_tolerance)
-    return replace(method, nodes=nodes)
-
-
-def average_error(mask: AbstractMask, grid: Grid, path: LightPath, nodes: int) -> float:
-    """Relative error of the PSF, of nodes that do not follow the fringes; 0 of others."""
-    known = _fringes(mask, grid, path)
-    return 0.0 if known is None or _follow(nodes, known[0]) else known[1] / nodes
-
-
-def _follow(nodes: int, fringes: float) -> bool:
-    few = _FEWER["float32"].get(nodes, 0.0)
-    return fringes <= few or nodes >= fringes * math.pi / 2 + _BEYOND
-
-
-def _fringes(mask: AbstractMask, grid: Grid, path: LightPath) -> tuple[float, float] | None:
-    """Fringes a pixel and the error of one node; None while the numbers are traced.
-
-    The band of the irradiance ends at width/(λd): so many fringes there are at most.
-    """
-    numbers = (*mask.extent, grid.pitch, path.wavelength, path.distance)
-    if any(checks.is_traced(number) for number in numbers):
-        return None
-    # In NumPy: inside jit, JAX would trace the product of known numbers too.
-    height, width, pitch, wavelength, distance = (float(np.asarray(n)) for n in numbers)
-    fringes = pitch * max(height, width) / (wavelength * distance)
-    return fringes, _LEFT * math.sqrt(pitch / min(height, width))
 
 
 @jax.jit

@@ -11,8 +11,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.method import PIXEL_NODES
-from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.method import PIXEL_NODES, pixel_nodes
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
 from thincam_jax.measured.calibration.coarse import descend
 from thincam_jax.measured.calibration.problem import PARAMETERS, FitState, Synthesis
