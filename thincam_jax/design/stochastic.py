@@ -71,21 +71,13 @@ def _descend(problem, point, key, steps: int, rate):
 DrawnLoss = Callable[[Any, Any], tuple[Any, Any]]
 
 
-def adam(
-    loss: DrawnLoss,
-    start: Any,
-    key: PRNGKeyArray,
-    rate: Float[Array, ""],
-    steps: int,
-    *,
-    most: float | None = None,
-):
+def adam(loss: DrawnLoss, start: Any, key: PRNGKeyArray, rate: Float[Array, ""], steps: int):
     """The parameters after so many steps, what was kept of each, and how many changed nothing.
 
     To be called inside jit. The rate falls to zero as a cosine; a step whose loss or slope is NaN
-    or infinite is skipped. `most`: the largest norm of a slope, to which longer ones are shortened.
+    or infinite is skipped.
     """
-    method = adam_method(most)
+    method = adam_method()
     place = jnp.linspace(0.0, 1.0, steps, dtype=rate.dtype)
     rates = rate * 0.5 * (1 + jnp.cos(jnp.pi * place))
 
@@ -103,7 +95,7 @@ def adam(
 
 
 def adam_method(most: float | None = None) -> optax.GradientTransformation:
-    """Adam's direction; `most` as of `adam`."""
+    """Adam's direction; `most`: the largest norm of a slope, to which longer ones are shortened."""
     method = optax.scale_by_adam()
     if most is None:
         return method

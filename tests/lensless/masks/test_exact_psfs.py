@@ -88,18 +88,14 @@ def eqx_set(mask, **numbers):
 
 @every_family("mura")
 def test_light_that_passes_arrives(name):
-    """Σ h pitch²/M² is the throughput's light, but for what is diffracted beyond the sensor."""
-    from thincam_jax.lensless.propagation.geometric import throughput
-
+    """Σ h pitch²/M² is the light that passes, but for what is diffracted beyond the sensor."""
     mask, half = families.masks()[name], 9.0
     height, width = (float(side) for side in mask.extent)
     pitch = 0.9 * WAVELENGTH * DISTANCE * 4 / width  # below 1/band
     count = int(2 * half / pitch)
     h = psf_of(mask, 60.0, sensor=tc.Sensor((count, count + 1), pitch), distance=4 * DISTANCE)
     arrived = h.sum() * pitch**2 / (1 + 4 * DISTANCE / 60.0) ** 2
-    passed = float(throughput(mask, WAVELENGTH)) * height * width
-    values = families.cells(name, mask)
-    assert passed == pytest.approx(np.mean(np.abs(values) ** 2) * height * width, rel=1e-12)
+    passed = np.mean(np.abs(families.cells(name, mask)) ** 2) * height * width
     assert 0 < 1 - arrived / passed < 0.03
 
 

@@ -3,7 +3,6 @@ r"""`geometric`: the mask's shadow, without diffraction."""
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax.lensless.camera import LightPath
@@ -52,17 +51,6 @@ def geometric(
     else:
         rows, columns = factor(down, y, grid.pitch / scale), factor(across, x, grid.pitch / scale)
     return SeparableSum(terms.coefficients[:, None] * rows, columns, grid)
-
-
-def throughput(mask: AbstractFactoredMask, wavelength: Number | None = None) -> Float[Array, ""]:
-    """The part of the light on the mask's aperture that passes it, the mean of |t|²."""
-    terms = mask.irradiance(wavelength)
-    middle = jnp.zeros(1, terms.coefficients.real.dtype)
-    rows, columns = (
-        _axis_averages(factors, middle, side)[:, 0]
-        for factors, side in zip((terms.rows, terms.columns), mask.extent, strict=True)
-    )
-    return jnp.sum(terms.coefficients * rows * columns).real
 
 
 def _axis_values(factors: AxisFactors, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:

@@ -3,7 +3,6 @@ r"""`fit_screen`: the parameters of a see-through screen from its matrix, or a f
 A matrix is valid for the distance at which it was measured, the fitted rays for all.
 """
 
-import operator
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -21,54 +20,17 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax._core.progress import watched
-from thincam_jax._core.quantity import quantities, unchecked
+from thincam_jax._core.quantity import unchecked
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.imaging.operators.masked import Scaled
-from thincam_jax.imaging.refractive_index import changed
 from thincam_jax.measured.calibration.problem import Status, covariance, hardly_seen, verdict
 from thincam_jax.measured.raw import MeasurementError
-from thincam_jax.waveguide import ObjectPlane, Screen, SeeThroughCamera, VolumeHologram
+from thincam_jax.waveguide import ObjectPlane, SeeThroughCamera
 from thincam_jax.waveguide.camera import seen_size
+from thincam_jax.waveguide.measured.screen_state import DEFAULT, PARAMETERS, QUANTITIES, ScreenState
 from thincam_jax.waveguide.rays import pixel_centres, trace
 from thincam_jax.waveguide.smear import trace_band
 from thincam_jax.waveguide.system import system_operator
-
-# Parameters that can be fitted, with a step of small effect on an image.
-PARAMETERS = {
-    "glass_thickness": 0.01,
-    "lens_distance": 0.1,
-    "focal_distance": 0.001,
-    "index": 1e-3,
-    "slant": 1e-3,
-    "tilt": 1e-3,
-    "plate_x": 1e-3,
-    "plate_y": 1e-3,
-    "shrinkage": 1e-3,
-    "film_thickness": 1e-4,
-    "index_modulation": 1e-4,
-    "object_distance": 1.0,
-    "object_x": 0.1,
-    "object_y": 0.1,
-}
-# Place in a state of the value to which a step is added, and its entry in a vector.
-_PLACES = {
-    "glass_thickness": ("camera.screen.glass_thickness", ...),
-    "lens_distance": ("camera.lens_distance", ...),
-    "focal_distance": ("camera.focal_distance", ...),
-    "plate_x": ("camera.tilt", 0),
-    "plate_y": ("camera.tilt", 1),
-    "film_thickness": ("camera.screen.hologram.thickness", ...),
-    "index_modulation": ("camera.screen.hologram.index_modulation", ...),
-    "object_distance": ("plane.distance", ...),
-    "object_x": ("plane.centre", 1),
-    "object_y": ("plane.centre", 0),
-    "gain": ("gain", ...),
-}
-_FIELDS = quantities(VolumeHologram, Screen, SeeThroughCamera, ObjectPlane)
-_FIELD_OF = {"slant": "tilt"} | {n: path.rpartition(".")[2] for n, (path, _) in _PLACES.items()}
-# Quantity of the attribute that each parameter is; ratios have no unit.
-QUANTITIES = {name: _FIELDS.get(_FIELD_OF.get(name, name), unchecked()) for name in PARAMETERS}
-DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
 _BLURS = (2.0, 0.7, 0.0)  # cells, one after another
@@ -137,60 +99,6 @@ class ScreenFit(Module):
         )
 
 
-class _State(eqx.Module):
-    camera: SeeThroughCamera
-    plane: ObjectPlane
-    gain: Array
-    shrinkage: Array
-
-    def moved(self, names: tuple[str, ...], steps) -> "_State":
-        state = self
-        for name, step in zip(names, steps, strict=True):
-            state = state._stepped(name, step)
-        return state
-
-    def _stepped(self, name: str, step) -> "_State":
-        screen, hologram = self.camera.screen, self.camera.screen.hologram
-        if name in _PLACES:
-            path, entry = _PLACES[name]
-            where = operator.attrgetter(path)
-            old = where(self)
-            new = old + step if entry is ... else old.at[entry].add(step)
-            return eqx.tree_at(where, self, new)
-        if name == "index":
-            indices = changed(hologram.index, step), changed(screen.glass_index, step)
-            paths = "camera.screen.hologram.index", "camera.screen.glass_index"
-            return eqx.tree_at(operator.attrgetter(*paths), self, indices)
-        if name == "shrinkage":
-            processed = hologram.processed(step), self.shrinkage + (1 - self.shrinkage) * step
-            return eqx.tree_at(lambda s: (s.camera.screen.hologram, s.shrinkage), self, processed)
-        turned = _turned(hologram.grating, name, step)
-        return eqx.tree_at(lambda s: s.camera.screen.hologram.grating, self, turned)
-
-    def value(self, name: str) -> Array:
-        screen, grating = self.camera.screen, self.camera.screen.hologram.grating
-        if name in _PLACES:
-            path, entry = _PLACES[name]
-            return operator.attrgetter(path)(self)[entry]
-        return {
-            "index": screen.glass_index(jnp.asarray(532e-6, grating.dtype)),
-            "slant": jnp.arctan2(jnp.hypot(grating[0], grating[1]), grating[2]),
-            "tilt": jnp.arctan2(grating[0], -grating[1]),
-            "shrinkage": self.shrinkage,
-        }[name]
-
-
-def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
-    """K with its slant from the film's normal changed, or turned about that normal."""
-    x, y, z = grating
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    if name == "tilt":
-        return jnp.stack([cos * x - sin * y, sin * x + cos * y, z])
-    across = jnp.sqrt(x**2 + y**2)
-    slanted = cos + sin * z / across
-    return jnp.stack([x * slanted, y * slanted, cos * z - sin * across])
-
-
 class _Smear(eqx.Module):
     """Smear of each order and pixel: it changes little with the screen; renewed for each blur.
 
@@ -220,7 +128,7 @@ class _Problem(eqx.Module):
     over the residual's unit. `full`: mean weight of a pixel. `smear`: smear of each pixel's band.
     """
 
-    start: _State
+    start: ScreenState
     measured: Array
     pixels: Array
     orders: Array | None
@@ -232,7 +140,7 @@ class _Problem(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
-    def state(self, steps: Array) -> _State:
+    def state(self, steps: Array) -> ScreenState:
         return self.start.moved(self.names, tuple(steps * self.unit))
 
 
@@ -289,7 +197,7 @@ def fit_screen(
         names, blurs = (*names, "gain"), _BLURS
     precision = precision_of(camera.lens_distance)
     with allow("float64", camera):
-        start = cast(_State(camera, plane, jnp.ones(()), jnp.zeros(())), "float64")
+        start = cast(ScreenState(camera, plane, jnp.ones(()), jnp.zeros(())), "float64")
         if isinstance(measured, Matrix):
             problem = _of_matrix(measured, start, names, orders)
         else:
@@ -330,7 +238,9 @@ def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlan
             )
 
 
-def _of_matrix(measured: Matrix, start: _State, names: tuple[str, ...], orders: int) -> _Problem:
+def _of_matrix(
+    measured: Matrix, start: ScreenState, names: tuple[str, ...], orders: int
+) -> _Problem:
     rows, columns = measured.out_shape
     step = max(1.0, (rows * columns / _PIXELS) ** 0.5)
     ys, xs = (np.unique(np.arange(step / 2, n, step).astype(int)) for n in (rows, columns))
@@ -354,7 +264,7 @@ def _of_matrix(measured: Matrix, start: _State, names: tuple[str, ...], orders: 
 
 
 def _of_positions(
-    measured: GhostPositions, start: _State, names: tuple[str, ...], orders: int
+    measured: GhostPositions, start: ScreenState, names: tuple[str, ...], orders: int
 ) -> _Problem:
     most = int(measured.orders.max())
     if most >= orders:
@@ -415,7 +325,7 @@ def _jacobian(problem: _Problem):
 
 
 @eqx.filter_jit
-def _model(state: _State, problem: _Problem):
+def _model(state: ScreenState, problem: _Problem):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
     camera, plane = state.camera, state.plane
     rays = trace(camera, problem.pixels, object_distance=plane.distance, orders=problem.count)

@@ -40,7 +40,13 @@ from thincam_jax.studies.pictures import (
     reconstruct_targets,
     reconstructed,
 )
-from thincam_jax.waveguide.measured.screen_fit import DEFAULT, PARAMETERS, QUANTITIES, ScreenFit
+from thincam_jax.waveguide.measured.screen_fit import ScreenFit
+from thincam_jax.waveguide.measured.screen_state import (
+    DEFAULT,
+    PARAMETERS,
+    QUANTITIES,
+    screen_values,
+)
 from thincam_jax.waveguide.studies.screen import GLASS, ScreenStudy, with_glass
 
 MEASURED = "measured matrix"
@@ -55,7 +61,7 @@ class Calibration:
       and `noise_std`: standard deviation of its white noise, in counts.
     - `keep_captures`: leave the stores of captures in the folder that is given.
     - `glass_thickness`: assumed before the fit, mm; None for the true one.
-    - `fitted`: the parameters that are found, keys of `waveguide.measured.screen_fit.PARAMETERS`.
+    - `fitted`: the parameters that are found, keys of `waveguide.measured.screen_state.PARAMETERS`.
       A plate whose tilt is fitted is taken for straight before.
     - `distances`: distances of the object, mm, at which the matrix follows from the fit and is
       measured anew.
@@ -337,7 +343,7 @@ class CalibrationRun:
 
     def _fit(self) -> None:
         """The screen from the matrix, which is let go of: another of its size may be measured."""
-        study, true = self.study, _true_values(self.study)
+        study, true = self.study, screen_values(self.study.camera, self.study.plane)
         began = time.perf_counter()
         self.fit = measuring.fit_screen(
             self.measured.matrix,  # pyright: ignore[reportArgumentType]
@@ -418,24 +424,3 @@ def _columns(
     found = {"measured": measured.matrix.matrix[:, numbers].T, "exact": exact}
     frame = len(cells), -1, *study.camera.sensor.shape
     return {n: np.asarray(each, float).reshape(frame)[:, middle] for n, each in found.items()}
-
-
-def _true_values(study: ScreenStudy) -> dict[str, float]:
-    """The parameters of the simulated screen that `fit_screen` can find."""
-    camera, plane = study.camera, study.plane
-    hologram = camera.screen.hologram
-    x, y, z = (float(number) for number in hologram.grating)
-    return {
-        "glass_thickness": float(camera.screen.glass_thickness),
-        "lens_distance": float(camera.lens_distance),
-        "focal_distance": float(camera.focal_distance),
-        "slant": math.atan2(math.hypot(x, y), z),
-        "tilt": math.atan2(x, -y),
-        "film_thickness": float(hologram.thickness),
-        "index_modulation": float(hologram.index_modulation),
-        "plate_x": float(camera.tilt[0]),
-        "plate_y": float(camera.tilt[1]),
-        "object_distance": float(plane.distance),
-        "object_x": float(plane.centre[1]),
-        "object_y": float(plane.centre[0]),
-    }
