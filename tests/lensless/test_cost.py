@@ -17,9 +17,9 @@ import pytest
 import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.imaging.operators.crop_convolution import kernel_shape
+from thincam_jax.imaging.operators.crop_convolution import convolution_cost, kernel_shape
 from thincam_jax.lensless.method import PsfMethod, psf_method
-from thincam_jax.lensless.resolve import convolution_cost, psf_cost
+from thincam_jax.lensless.resolve import psf_cost
 
 # The module itself: the package's attribute of that name is the function.
 PSF = importlib.import_module("thincam_jax.lensless.psf")

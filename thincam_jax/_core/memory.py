@@ -2,7 +2,24 @@
 
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The cost of one evaluation.
+
+    - `flops`: real operations, transcendental functions counted as the operations they take.
+    - `bytes`: peak memory, result included.
+    """
+
+    flops: float
+    bytes: int
+
+    def times(self, count: int) -> "Cost":
+        """Cost of `count` evaluations, one after another."""
+        return Cost(self.flops * count, self.bytes)
 
 
 def available_bytes() -> int | None:

@@ -14,7 +14,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import CropConvolution
-from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import convolution_cost, kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
@@ -22,7 +22,6 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.field import field_fit
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import spectral_psf
-from thincam_jax.lensless.resolve import convolution_cost
 
 Colours = Sequence[tuple[Number, Number]]
 

@@ -274,9 +274,11 @@ def pixel_nodes(
     if known is None:
         return PIXEL_NODES
     fringes, left = known
-    few = [n for n, most in _FEWER[precision].items() if fringes <= most]
-    few += [n for n in _MORE if _follow(n, fringes) or left <= tolerance * n]
-    return next(iter(few), _MORE[-1])
+    for nodes, most in _FEWER[precision].items():
+        if fringes <= most:
+            return nodes
+    enough = (n for n in _MORE if _follow(n, fringes) or left <= tolerance * n)
+    return next(enough, _MORE[-1])
 
 
 def with_nodes(method: PsfMethod, mask: AbstractMask, grid: Grid, path: LightPath) -> PsfMethod:

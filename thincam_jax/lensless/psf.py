@@ -111,10 +111,14 @@ def psf_about_ray(
     object_distance: Number,
     at: Position | None,
     method: PsfMethod,
+    grid: Grid | None = None,
 ) -> Float[Array, "y x"]:
-    """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
-    light = wavelength, object_distance, at
-    return _computed(_PSF, camera, light, method, follows=at is not None)
+    """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets.
+
+    `grid`: samples in place of the sensor's.
+    """
+    light, grid = (wavelength, object_distance, at), camera.sensor.grid if grid is None else grid
+    return _computed(_PSF, camera, light, method, about_ray=grid)
 
 
 def spectral_psf(
@@ -126,10 +130,9 @@ def spectral_psf(
     at: Position | None = None,
 ) -> Float[Array, "y x"]:
     """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
-    own = camera.on_grid(grid)
     parts = []
     for wavelength, weight in light:
-        h = psf_about_ray(own, wavelength, object_distance, at, method)
+        h = psf_about_ray(camera, wavelength, object_distance, at, method, grid)
         is_whole = not checks.is_traced(weight) and bool(np.asarray(weight) == 1)
         parts.append(h if is_whole else weight * h)  # of one colour nothing to compile
     return functools.reduce(operator.add, parts)
@@ -299,16 +302,21 @@ def _computed(
     light: tuple[Any, ...],
     model: Model | PsfMethod,
     pixel_integration: bool = True,
-    *,
-    follows: bool = False,
+    about_ray: Grid | None = None,
 ):
-    """A function of what `resolve` gives for the path of light, in the camera's precision."""
-    path = camera.path(*light)
-    path = replace(path, follows=True) if follows else path
+    """A function of what `resolve` gives for the path of light, in the grid's precision.
+
+    `about_ray`: samples about the point's ray, in place of the sensor's about the axis.
+    """
+    path, grid = camera.path(*light), about_ray
+    if grid is None:
+        grid = camera.sensor.grid
+    elif path.at is not None:
+        path = replace(path, follows=True)
     if path.at is None and path.place is not None and as_method(model).model in SAMPLED:
         path = replace(path, at=jnp.zeros_like(path.place))  # these follow the ray
-    mask, grid, path, method = resolve(camera, path, model, pixel_integration)
-    own, (of_mask, of_terms) = precision_of(camera.sensor.pitch), functions
+    own, (of_mask, of_terms) = precision_of(grid.pitch), functions
+    mask, grid, path, method = resolve(camera.mask, grid, path, model, pixel_integration)
     with allow(method.precision or own, mask, grid, path), watched("computing the PSF"):
         terms = _known_terms(mask, grid, path, method)
         result = of_mask(mask, grid, path, method) if terms is None else of_terms(terms, grid)

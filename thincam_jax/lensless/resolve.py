@@ -7,7 +7,7 @@ buffers that XLA allocates on a CPU (``compiled.memory_analysis()``) and from ti
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.grids import Grid, fast_shape
-from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.memory import Cost, refuse_if_too_large
 from thincam_jax._core.precision import allow, cast, itemsize_of, precision_of
 from thincam_jax.lensless.camera import ERROR_PER_RADIAN, LenslessCamera, LightPath
 from thincam_jax.lensless.masks.base import (
@@ -277,22 +277,6 @@ _BASE = 4096
 _BATCH = 64
 
 
-@dataclass(frozen=True)
-class Cost:
-    """The cost of one evaluation.
-
-    - `flops`: real operations, transcendental functions counted as the operations they take.
-    - `bytes`: peak memory, result included.
-    """
-
-    flops: float
-    bytes: int
-
-    def times(self, count: int) -> "Cost":
-        """Cost of `count` evaluations, one after another."""
-        return Cost(self.flops * count, self.bytes)
-
-
 def psf_cost(mask: AbstractMask, grid: Grid, method: PsfMethod) -> Cost:
     """Cost of `psf` on a grid."""
     rows, columns = grid.shape
@@ -357,23 +341,13 @@ def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[flo
     return float(flops + 4 * terms * math.prod(shape)), float(held)
 
 
-def convolution_cost(
-    sensor_shape: tuple[int, int], field_shape: tuple[int, int], images: int, itemsize: int
-) -> Cost:
-    """Cost of one crop-convolution of `images` fields with a PSF that is given."""
-    kernel = tuple(s + f - 1 for s, f in zip(sensor_shape, field_shape, strict=True))
-    window = math.prod(fast_shape((kernel[0], kernel[1]), real=True))
-    transforms = 2 * images + 1
-    flops = transforms * 2.5 * window * math.log2(window + 1) + 6 * images * window
-    return Cost(flops, int(itemsize * window * (3 * images + 4)))
-
-
 # Operations of samples chosen by default, some ten seconds, that are warned of.
 _SLOW = 1e10
 
 
 def resolve(
-    camera: LenslessCamera,
+    mask: AbstractMask,
+    grid: Grid,
     path: LightPath,
     model: Model | PsfMethod,
     pixel_integration: bool = True,
@@ -385,7 +359,6 @@ def resolve(
     **Errors**: those of `psf`. AccuracyWarning, at the caller of the caller of `psf`, for samples
     chosen by default that are coarse or slow.
     """
-    mask, grid = camera.mask, camera.sensor.grid
     given = method = as_method(model, pixel_integration)
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
     method = with_nodes(method, mask, grid, path)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float, Num
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid, fast_shape
+from thincam_jax._core.memory import Cost
 from thincam_jax._core.precision import squared_modulus
 from thincam_jax.imaging.operators.base import AbstractOperator
 
@@ -260,3 +261,14 @@ def window_shape(
 def kernel_grid(sensor: Grid, field_shape: tuple[int, int]) -> Grid:
     """The grid of the PSF for `CropConvolution`."""
     return sensor.with_shape(kernel_shape(sensor.shape, field_shape))
+
+
+def convolution_cost(
+    sensor_shape: tuple[int, int], field_shape: tuple[int, int], images: int, itemsize: int
+) -> Cost:
+    """Cost of a `CropConvolution` of `images` fields with a PSF that is given."""
+    whole = kernel_shape(sensor_shape, field_shape)
+    window = math.prod(window_shape(sensor_shape, field_shape, whole))
+    transforms = 2 * images + 1
+    flops = transforms * 2.5 * window * math.log2(window + 1) + 6 * images * window
+    return Cost(flops, int(itemsize * window * (3 * images + 4)))

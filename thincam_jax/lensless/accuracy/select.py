@@ -11,7 +11,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.memory import available_bytes
+from thincam_jax._core.memory import Cost, available_bytes
 from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, precision_of
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.accuracy.sampled import sampled_errors
@@ -28,7 +28,7 @@ from thincam_jax.lensless.method import (
     sampled_off_axis,
 )
 from thincam_jax.lensless.propagation.skew import corner_error
-from thincam_jax.lensless.resolve import Cost, held_in_single, psf_cost, require_off_axis
+from thincam_jax.lensless.resolve import held_in_single, psf_cost, require_off_axis
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.

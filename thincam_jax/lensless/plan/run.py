@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.memory import readable, refuse_if_too_large
+from thincam_jax._core.memory import Cost, readable, refuse_if_too_large
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import probe_of
@@ -19,7 +19,6 @@ from thincam_jax.lensless.forward import operator_of, project, projected_shape
 from thincam_jax.lensless.masks.base import has_few_terms
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import SAMPLED, PsfMethod
-from thincam_jax.lensless.resolve import Cost
 
 
 @dataclass(frozen=True)

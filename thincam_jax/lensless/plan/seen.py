@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import SparseGrid
+from thincam_jax._core.memory import Cost
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast, itemsize_of, product
-from thincam_jax.imaging.operators.crop_convolution import kernel_grid
+from thincam_jax.imaging.operators.crop_convolution import convolution_cost, kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
 from thincam_jax.lensless.field import points_needed, tangents_of
@@ -33,13 +34,7 @@ from thincam_jax.lensless.method import (
     with_nodes,
 )
 from thincam_jax.lensless.psf import closed_terms, spectral_psf
-from thincam_jax.lensless.resolve import (
-    Cost,
-    convolution_cost,
-    held_in_single,
-    psf_cost,
-    samples_needed,
-)
+from thincam_jax.lensless.resolve import held_in_single, psf_cost, samples_needed
 
 Point = tuple[float, float] | None
 Transfer = Complex[np.ndarray, " k"]
