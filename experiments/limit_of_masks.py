@@ -43,7 +43,11 @@ cameras = {  # pitch, read noise in electrons, cells, steps and masks of a desce
     "pixels of 5.5 µm": (0.0055, 8.0, 512, (40, 1), {"little": 2e3, "plenty": 2e5}),
 }
 if not full:
-    cameras = {"pixels of 176 µm": (0.176, 64.0, 32, (5, 1), {"plenty": 2.048e5})}
+    lights = {"plenty": 2.048e5}
+    cameras = {
+        f"pixels of {pitch:.0f} µm": (pitch / 1000, 64.0, 32, (5, 1), lights)
+        for pitch in (176.0, 352.0)
+    }
 phases = (0.0, 1.5 * np.pi)
 
 

@@ -12,6 +12,7 @@ import dataclasses
 import os
 from pathlib import Path
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -169,12 +170,14 @@ lamps = {
     "lasers": [wg.ColourBand(c * nm, 1 * nm) for c in (450, 532, 638)],
     "532 nm": [wg.ColourBand(532 * nm, 1 * nm)],
 }
-for degrees in (-10.0, -3.0, 0.0, 3.0, 10.0):
-    along = np.array([0.0, np.sin(np.radians(degrees))])
+angles, tints = (-10.0, -3.0, 0.0, 3.0, 10.0), {name: [] for name in lamps}
+for degrees in angles:
+    along = jnp.array([0.0, np.sin(np.radians(degrees))])
     words = []
     for name, primaries in lamps.items():
         through = tint(film, along, primaries)
         moved = np.hypot(*through.shift)
+        tints[name].append((100 * through.luminance, moved))
         words.append(f"{name} {100 * through.luminance:.0f} %, Δu′v′ {moved:.3f}")
     print(f"{degrees:3.0f}°: " + "; ".join(words))
 
@@ -201,3 +204,14 @@ pair = [images[near, "best", one] for one in (apertures[0], wide)]
 axes[2].imshow(np.hstack([np.asarray(one) for one in pair]), cmap="gray", vmin=0, vmax=1)
 axes[2].set(title=f"{near:.0f} mm, aperture {apertures[0]} | {wide} mm", xticks=[], yticks=[])
 figure.savefig(FIGURES / "near-screen.png", dpi=120)
+
+# %%
+
+figure, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
+for (name, found), style in zip(tints.items(), ("o-", "s--", "^:"), strict=True):
+    for ax, values in zip(axes, zip(*found, strict=True), strict=True):
+        ax.plot(angles, values, style, color="black", label=name)
+axes[0].set(xlabel="angle, degrees", ylabel="light that goes through, %", ylim=(0, None))
+axes[1].set(xlabel="angle, degrees", ylabel="shift of white, Δu′v′")
+axes[0].legend(frameon=False)
+figure.savefig(FIGURES / "tint.png", dpi=120)

@@ -99,8 +99,21 @@ for ax, (name, image) in zip(axes[1:], images.items(), strict=True):
     seen = np.asarray(align(jnp.asarray(image, jnp.float32), jnp.asarray(truth, jnp.float32)))
     decibels = float(psnr(jnp.asarray(seen), jnp.asarray(truth, jnp.float32)))
     print(f"{name:12} {decibels:5.1f} dB after gain and offset")
+    images[name] = seen
     ax.imshow(seen, cmap="gray", vmin=0, vmax=1)
     ax.set_title(f"{name}\n{decibels:.1f} dB", fontsize=9)
 for ax in axes:
     ax.set(xticks=[], yticks=[])
 figure.savefig(FIGURES / "other-packages.png", dpi=120)
+
+# %%
+# Four rows of the images:
+
+figure, axes = plt.subplots(2, 2, figsize=(10, 5), sharey=True, layout="constrained")
+for ax, place in zip(axes.flat, (0.2, 0.4, 0.6, 0.8), strict=True):
+    row = int(place * len(truth))
+    for name, image in {"photograph": truth, **images}.items():
+        ax.plot(image[row], "k:" if image is truth else "-", label=name)
+    ax.set(title=f"row {row}", xlabel="x (pixels)", ylabel="brightness (white = 1)")
+axes[0, 0].legend(fontsize=8)
+figure.savefig(FIGURES / "rows.png", dpi=100)

@@ -86,7 +86,7 @@ def tint(
     - `direction`: direction cosines (x, y) in air.
 
     ```python
-    import numpy as np
+    import jax.numpy as jnp
 
     from thincam_jax import waveguide as wg
     from thincam_jax.units import deg, nm, um
@@ -96,7 +96,7 @@ def tint(
         532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
     )
     bands = ((450 * nm, 20 * nm), (530 * nm, 35 * nm), (625 * nm, 20 * nm))
-    seen = tint(film, np.zeros(2), [wg.ColourBand(*band) for band in bands])
+    seen = tint(film, jnp.zeros(2), [wg.ColourBand(*band) for band in bands])
     print(round(seen.luminance, 2))  # 0.84
     ```
     """
