@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import Polar, PowerLaw, Setup, shots
+from thincam_jax.design import PowerLaw, Setup, shots
 from thincam_jax.design.objectives import bayes_error, channels
-from thincam_jax.design.setup import Quadrant
+from thincam_jax.design.setup import Polar, Quadrant
 from thincam_jax.reconstruction import phase_pairs
 
 HIGHEST = 290.0

@@ -22,7 +22,7 @@ from thincam_jax.design import (
     design_problem,
     shots,
 )
-from thincam_jax.design.limit import limit
+from thincam_jax.design.least_error import limit
 from thincam_jax.design.objectives import ObjectiveData
 from thincam_jax.design.setup import Quadrant
 

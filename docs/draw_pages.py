@@ -23,8 +23,9 @@ from matplotlib.figure import Figure
 import thincam_jax as tc
 from thincam_jax import design
 from thincam_jax.design.landscape import evaluate_grid
-from thincam_jax.design.match import ring_levels
+from thincam_jax.design.match import ResponseModel, match_response, ring_levels
 from thincam_jax.design.objectives import bayes_error, channels
+from thincam_jax.design.setup import Polar
 from thincam_jax.lensless.masks import (
     UniformlyRedundantArray,
     maximum_length_sequence,
@@ -96,7 +97,7 @@ def design_landscape():
     """The expected error over two pitches of the thesis' camera, as docs/guide/design.md."""
     space, *data = _two_pitches()
     count, (low, high) = 57, (8.0, 36.0)
-    data = (*data, design.Polar(290.0, 128, 2))
+    data = (*data, Polar(290.0, 128, 2))
     _, error = evaluate_grid(_expected_error, space, data, count)
     level = _decibels(error / jnp.nanmin(error)).reshape(count, count)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
@@ -117,7 +118,7 @@ def design_landscape():
 def design_front():
     """The expected error against the camera's thickness: pitches of the thesis, and the best."""
     space, *data = _two_pitches()
-    data = (*data, design.Polar(290.0, 128, 2))
+    data = (*data, Polar(290.0, 128, 2))
     distances = np.linspace(3.0, 6.5, 8)
     lines = {"β 25 and 21 rad/mm²": ("0.6", "s"), "the best β of each thickness": ("k", "o")}
     levels = []
@@ -138,14 +139,12 @@ def design_front():
 def suggest():
     """A wanted response, which is that of a hidden design, and what the search finds for it."""
     space, *data = _two_pitches()
-    rings = design.Polar(96.0, 128, 2)
+    rings = Polar(96.0, 128, 2)
     hidden = design.shots(
         jnp.array([17.0, 12.5]), 6.5, (0.0, 1.5 * jnp.pi), wavelength=500 * nm, width=5.632
     )
     wanted = ring_levels(channels(hidden, *data, rings), rings, 32)
-    best = design.match_response(
-        design.ResponseModel(space, *data, rings), wanted, key=jax.random.key(1)
-    )
+    best = match_response(ResponseModel(space, *data, rings), wanted, key=jax.random.key(1))
     thesis = channels(space.base, *data, rings)
     figure = Figure(figsize=(6.4, 3.4), layout="constrained")
     ax = figure.subplots()

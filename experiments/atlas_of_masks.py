@@ -19,9 +19,8 @@ import scipy.stats
 from tools.photographs import halved, photographs
 
 import thincam_jax as tc
-from thincam_jax.design.cell_masks import CellMasks
-from thincam_jax.design.limit import limit
-from thincam_jax.design.recommendation import KINDS, MaskJudge, recommend, zone_plates
+from thincam_jax.design import CellMasks, limit, recommend
+from thincam_jax.design.recommendation import KINDS, MaskJudge, zone_plates
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds

@@ -18,8 +18,9 @@ import numpy as np
 from tools.photographs import halved, photographs
 
 import thincam_jax as tc
-from thincam_jax.design.cell_masks import CellMasks, CellOptics, without_lone_cells
-from thincam_jax.design.cell_search import CellSettings, find_cells
+from thincam_jax.design import CellMasks, find_cells
+from thincam_jax.design.cell_masks import CellOptics, without_lone_cells
+from thincam_jax.design.cell_search import CellSettings
 from thincam_jax.design.expected_error import ExpectedError
 from thincam_jax.design.objectives import Tolerances
 from thincam_jax.design.phase_mask import mask_of_phase, one_turn

@@ -20,10 +20,10 @@ from PIL import Image
 from tools.photographs import halved, photographs
 
 import thincam_jax as tc
-from thincam_jax.design.cell_masks import CellMasks, CellOptics, drawn_cells
-from thincam_jax.design.cell_search import CellSettings, find_cells
+from thincam_jax.design import CellMasks, find_cells, limit
+from thincam_jax.design.cell_masks import CellOptics, drawn_cells
+from thincam_jax.design.cell_search import CellSettings
 from thincam_jax.design.expected_error import ExpectedError
-from thincam_jax.design.limit import limit
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds

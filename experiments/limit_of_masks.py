@@ -18,7 +18,7 @@ import numpy as np
 import optax
 
 import thincam_jax as tc
-from thincam_jax.design.limit import limit
+from thincam_jax.design import limit
 from thincam_jax.design.objectives import bayes_error, channels, over_rings
 from thincam_jax.reconstruction import phase_pairs
 from thincam_jax.units import nm

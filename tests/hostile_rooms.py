@@ -11,7 +11,13 @@ import thincam_jax as tc
 from thincam_jax import design, hardware, learn, measured, studies
 from thincam_jax.design.design import Design
 from thincam_jax.design.fronts import non_dominated
-from thincam_jax.design.match import MatchSettings, response_misfit, ring_levels
+from thincam_jax.design.match import (
+    MatchSettings,
+    ResponseModel,
+    match_response,
+    response_misfit,
+    ring_levels,
+)
 from thincam_jax.design.objectives import (
     Tolerances,
     bayes_error,
@@ -25,7 +31,7 @@ from thincam_jax.design.objectives import (
 from thincam_jax.design.phase_mask import MaskSetting, mask_of_phase, one_turn
 from thincam_jax.design.phase_retrieval import contour_target
 from thincam_jax.design.ranking import score_design
-from thincam_jax.design.setup import fit_power_law
+from thincam_jax.design.setup import Polar, fit_power_law
 from thincam_jax.design.space import Limits
 from thincam_jax.hardware import plans
 from thincam_jax.hardware.acquisition.plan import AcquisitionPlan, AcquisitionStep
@@ -85,7 +91,7 @@ SPACE = call(
     variable=call(design.Variable, name="beta", lower=10.0, upper=25.0, captures=(0,)),
     limits=call(Limits, mask_pixel=0.01, thickness=8.0, captures=4, exposure=2.0),
 )
-RINGS = call(design.Polar, highest=80.0, count=64, directions=2)
+RINGS = call(Polar, highest=80.0, count=64, directions=2)
 SEEN = {"setup": SETUP, "synthesis": np.eye(2), "frequencies": RINGS}
 KNOWN = call(channels, design=DESIGN, **SEEN)
 TOLERANCES = call(Tolerances, beta=0.01, distance=0.01, wavelength=1e-5, tilt=0.01)
@@ -123,8 +129,8 @@ DESIGNS = (
     ),
     call(design.landscape_around, problem=PROBLEM, design=DESIGN, count=3, at_a_time=2),
     call(
-        design.match_response,
-        model=call(design.ResponseModel, space=SPACE, **SEEN, rings=8),
+        match_response,
+        model=call(ResponseModel, space=SPACE, **SEEN, rings=8),
         target=np.ones(8),
         settings=call(MatchSettings, starts=1, samples=4, steps=2, tolerance=1e-3),
         key=KEY,

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from design.setting import setup, two_betas
 
-from thincam_jax.design import Polar, PowerLaw, ResponseModel, match_response
-from thincam_jax.design.match import MatchSettings
+from thincam_jax.design import PowerLaw
+from thincam_jax.design.match import MatchSettings, ResponseModel, match_response
+from thincam_jax.design.setup import Polar
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16

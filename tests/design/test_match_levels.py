@@ -9,9 +9,10 @@ import pytest
 from design.setting import setup, thesis_design, two_betas
 
 from helpers import finite_difference
-from thincam_jax.design import Polar, PowerLaw
+from thincam_jax.design import PowerLaw
 from thincam_jax.design.match import ResponseModel, checked_levels, response_misfit, ring_levels
 from thincam_jax.design.objectives import channels
+from thincam_jax.design.setup import Polar
 from thincam_jax.reconstruction import phase_pairs
 
 FREQUENCIES = Polar(96.0, 128, 2)

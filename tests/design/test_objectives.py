@@ -11,7 +11,7 @@ from design import small
 from design.setting import HIGHEST, setup
 
 from helpers import count_traces, finite_difference
-from thincam_jax.design import BayesError, PhotonNoise, Polar, PowerLaw, SignalNoise
+from thincam_jax.design import BayesError, PhotonNoise, PowerLaw, SignalNoise
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import (
     Channels,
@@ -25,7 +25,7 @@ from thincam_jax.design.objectives import (
     unevenness,
     worst_ratio_db,
 )
-from thincam_jax.design.setup import Quadrant
+from thincam_jax.design.setup import Polar, Quadrant
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction import phase_pairs
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from design.setting import setup, thesis_design
 
-from thincam_jax.design import Polar, PowerLaw
+from thincam_jax.design import PowerLaw
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import (
     Tolerances,
@@ -16,6 +16,7 @@ from thincam_jax.design.objectives import (
     mismatch_error,
     robust_error,
 )
+from thincam_jax.design.setup import Polar
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 

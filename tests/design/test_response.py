@@ -11,7 +11,7 @@ from design.setting import HIGHEST, WAVELENGTH, setup, thesis_design
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.design import Polar, PowerLaw, Setup
+from thincam_jax.design import PowerLaw, Setup
 from thincam_jax.design.design import Design
 from thincam_jax.design.objectives import bayes_error, channels, ring_means
 from thincam_jax.design.response import (
@@ -21,7 +21,7 @@ from thincam_jax.design.response import (
     signal_variance,
     spectral_density,
 )
-from thincam_jax.design.setup import Quadrant
+from thincam_jax.design.setup import Polar, Quadrant
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless import LightPath
 from thincam_jax.lensless.exposures import Exposures

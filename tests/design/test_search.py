@@ -9,12 +9,13 @@ from design.setting import HIGHEST, error, setup, two_betas
 from design.test_sensitivity import Bowl, found_at
 
 from helpers import in_full, quick
-from thincam_jax.design import Polar, PowerLaw, SearchSettings, find_designs
+from thincam_jax.design import PowerLaw, SearchSettings, find_designs
 from thincam_jax.design.landscape import evaluate_grid
 from thincam_jax.design.objectives import bayes_error, ring_means
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.ranking import rank_designs, score_design
 from thincam_jax.design.search import random_search
+from thincam_jax.design.setup import Polar
 
 SPACE = two_betas()
 DEEPEST = np.array([14.3, 29.1])

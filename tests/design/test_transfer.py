@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import Polar, Setup, SignalNoise, objectives, ranking, shots
+from thincam_jax.design import Setup, SignalNoise, objectives, ranking, shots
 from thincam_jax.design.objectives import Channels, ObjectiveData
 from thincam_jax.design.ranking import modulation_transfer
-from thincam_jax.design.setup import Quadrant
+from thincam_jax.design.setup import Polar, Quadrant
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction import phase_pairs

@@ -16,8 +16,8 @@ import pytest
 from reconstruction.test_choose_tau import posed, solved
 
 from helpers import ROOT
-from thincam_jax.learn import learn_tau
 from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.tau import learn_tau
 from thincam_jax.learn.training import (
     Task,
     TrainingOptions,

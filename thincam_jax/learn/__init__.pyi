@@ -2,5 +2,4 @@
 
 from .denoiser.network import Denoiser as Denoiser
 from .refocusing.network import RefocusNetwork as RefocusNetwork
-from .tau import learn_tau as learn_tau
 from .unrolled import UnrolledAdmm as UnrolledAdmm

@@ -21,7 +21,7 @@ from thincam_jax.design import SearchSettings, find_designs
 from thincam_jax.design.design import Design
 from thincam_jax.design.fronts import FrontPoint, FrontSearch, front_point, search_order
 from thincam_jax.design.landscape import Landscape, landscape_if_any
-from thincam_jax.design.limit import Limit, limit
+from thincam_jax.design.least_error import Limit, limit
 from thincam_jax.design.objectives import AbstractObjective, BayesError
 from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.ranking import (

@@ -86,7 +86,7 @@ def limit(problem: DesignProblem, masks: Masks = "shadow") -> Limit:
     setup = tc.design.Setup(44 * um, 1.4, 250.0, 179.0, noise=tc.design.PhotonNoise(2e4))
     space = tc.design.DesignSpace(design, (tc.design.Variable("beta", 6.0, 20.0, (0,)),))
     problem = tc.design.design_problem(tc.design.BayesError(), space, setup, [[1.0]])
-    least = tc.design.limit.limit(problem)
+    least = tc.design.limit(problem)
     least.above(float(tc.design.BayesError()(design, problem.best_data)))  # dB
     ```
 

@@ -21,7 +21,7 @@ from thincam_jax.design import (
     design_problem,
     shots,
 )
-from thincam_jax.design.limit import KINDS, limit
+from thincam_jax.design.least_error import KINDS, limit
 from thincam_jax.design.objectives import ObjectiveData
 from thincam_jax.design.setup import Quadrant
 from thincam_jax.design.space import Limits
