@@ -325,7 +325,7 @@ CARDS = {
     "sts_design": ("screen-design.png", 24, 0, 374),
     "sts_realtime": ("sts-speed.png", 575, 0, 418),
     "superresolution": ("usaf-1951.png", 948, 99, 205),
-    "three_lines": ("three-lines.png", 787, 84, 207),
+    "three_lines": ("three-lines.png", 815, 34, 252),
     "video": ("video.png", 854, 21, 223),
     "when_it_looks_wrong": ("when-it-looks-wrong.png", 47, 826, 258),
     "trained_reconstruction": ("trained-simulated.png", 1245, 10, 120),

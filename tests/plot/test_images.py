@@ -34,6 +34,17 @@ def test_images_are_compared_with_the_truth():
             tc.plot.compare(images, truth=truth)
 
 
+@pytest.mark.parametrize("rows", [5, 13, 20])  # wide, square and high
+def test_titles_and_labels_lie_on_the_figure(rows):
+    image = RNG.uniform(size=(rows, 13))
+    figure = tc.plot.compare({"scene": image, "capture": IMAGE, "image": result(image, 0.1)})
+    figure.draw_without_rendering()
+    for ax in figure.axes:
+        box = ax.get_tightbbox()
+        assert box.x0 >= 0 and box.y0 >= 0
+        assert box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
+
+
 @pytest.mark.parametrize(
     ("shape", "pitch", "shown", "widths"),
     [
@@ -53,6 +64,7 @@ def test_a_result_shows_itself_on_axes(shape, pitch, shown, widths):
         assert image.get_array().shape == shown and ax.axison
         assert ax.get_xlabel() == ("x (mm)" if width else "x (pixels)")
         assert not width or np.ptp(image.get_extent()[:2]) == pytest.approx(width)
+        assert len(ax.get_xticks()) > 1 and len(ax.get_yticks()) > 1
     first = linear[0] if len(widths) > 1 else np.moveaxis(linear, 0, -1 if len(shape) > 2 else 0)
     levels = np.asarray(figure.axes[0].images[0].get_array())
     assert np.corrcoef(first.ravel() ** (1 / 2.2), levels.ravel())[0, 1] > 0.99

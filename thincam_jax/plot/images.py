@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib.figure
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, pixel_pitch
@@ -69,8 +70,13 @@ def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
                 f"{name!r} has shape {image.shape}, the truth {arrays[truth].shape}; give the "
                 "truth on the same pixels, as by ImagePlane.sample"
             )
-    figure = new_figure(3.2 * len(arrays), 3.4)
-    panels = figure.subplots(1, len(arrays), squeeze=False)[0]
+    # Images of one height; constrained layout alone cuts the titles of square ones.
+    widths = [np.clip(image.shape[1] / image.shape[0], 0.4, 2.5) for image in arrays.values()]
+    labels = 0.7 * sum(getattr(one, "pitch", None) is not None for one in images.values())
+    height = min(3.2 * len(widths) / sum(widths), 4.0)
+    figure = new_figure(height * sum(widths) + labels + 0.1 * len(widths), height + 0.8)
+    figure.set_layout_engine("compressed")
+    panels = figure.subplots(1, len(widths), squeeze=False, width_ratios=widths)[0]
     for ax, (name, image) in zip(panels, arrays.items(), strict=True):
         pitch = getattr(images[name], "pitch", None)
         if pitch is None:
@@ -95,10 +101,12 @@ def draw_result(result: "Reconstruction") -> matplotlib.figure.Figure:
     images = every[:_MOST]
     pitches = [None] if result.pitch is None else np.ravel(result.pitch).tolist()
     aspect = np.clip(images[0].shape[0] / images[0].shape[1], 0.25, 2.0)
-    figure, panels = sheet(len(images), _BESIDE, max(5.0 / len(images), 2.5), aspect, 0.4)
+    figure, panels = sheet(len(images), _BESIDE, max(5.0 / len(images), 2.5), aspect, 0.2)
     for ax, image, pitch in zip(panels, eight_bit(np.stack(images)), cycle(pitches), strict=False):
         show_image(ax, image, pitch, vmin=0, vmax=255)
         ax.set_axis_on()
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_locator(MaxNLocator(4 if len(images) > 1 else "auto"))
     if len(every) > _MOST:
         figure.suptitle(f"the first {_MOST} of {len(every)} images")
     return figure
