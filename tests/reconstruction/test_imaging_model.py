@@ -191,3 +191,24 @@ def test_another_geometry_may_not_hold_the_whole_scene():
     assert not model.replace(field_shape=(12, 16)).whole_scene
     assert not model.replace(object_distance=125.0).whole_scene
     assert model.replace(field_shape=(48, 64), whole_scene=True).whole_scene
+
+
+def test_a_pedestal_of_a_psf_is_said(caplog):
+    """Of 6 % of its mean light, with noise; what is advised is silent, and so is a PSF of light."""
+    chance = np.random.default_rng(0)
+    spots = np.zeros((40, 56))
+    spots[8:30, 12:44] = chance.random((22, 32)) ** 4
+    spots += 1e-4 * chance.standard_normal(spots.shape)
+    y, x = pixels(spots.shape)
+    wide = np.exp(-(y**2 + x**2) / 300)  # darkest in its corners, where it is not uniform
+    for clean in (spots, chance.random(spots.shape), wide, spots[:30, :30]):
+        tc.Psfs(clean[None])
+    assert not caplog.records
+    level = 0.06 * spots.mean()
+    tc.Psfs(np.stack([spots, spots + level]))
+    (record,) = caplog.records
+    told = float(record.getMessage().partition("psfs - ")[2].rstrip(")"))
+    assert told == pytest.approx(level, rel=0.05) and "6 % of its mean" in caplog.text
+    caplog.clear()
+    tc.Psfs((spots + level - told)[None])
+    assert not caplog.records

@@ -8,6 +8,8 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Shaped
 
+from thincam_jax._core.grids import block_sum, central_blocks
+
 _FEW = 20  # pixels at one value that a clean image may have
 _STEEP = 3.0  # times as many pixels as at each of the values below
 _ISOLATED = 3.0  # times the range of the neighbours, by which a defective pixel exceeds them
@@ -20,6 +22,10 @@ _MOST, _WIDE = 0.1, 4  # share of pixels at one value, and width of lines, that 
 _APART = 4.0  # times the range of the `_FEW` next values, by which a lowest value is apart
 _BLOCKS, _LARGE = 4, 9  # blocks at one value, and pixels of one that is no shadow
 _SQUARE = np.ones((3, 3), bool)
+_LIT = 0.15  # largest part of the mean light that a dark place may hold
+# Image over the side of a corner, pixels of one at least, the largest difference of its quarters
+# over its level, and the least level over the mean light above it, which costs 0.4 to 0.9 dB.
+_CORNER, _SMALL, _EVEN, _PEDESTAL = 8, 4, 0.1, 0.05
 
 
 def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
@@ -227,3 +233,38 @@ def fine_noise(plane: np.ndarray) -> float:
     """Standard deviation of noise, by the median of second differences along rows."""
     bend = plane[:, 1:-1] - (plane[:, 2:] + plane[:, :-2]) / 2
     return 1.21 * float(np.median(np.abs(bend)))
+
+
+def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
+    """Whether a level is as low as the darkest square of an image (channel, y, x).
+
+    Above the darkest of all squares of `side` pixels, it lies by at most 15 % of what the mean of
+    the image does.
+    """
+    side = min(side, *image.shape[1:])
+    kept = image[:, *central_blocks(image.shape[1:], side)]
+    means = block_sum(kept, side, np.float64) / side**2
+    lowest = means.min(axis=(1, 2), keepdims=True)
+    light = means.mean(axis=(1, 2), keepdims=True) - lowest
+    return bool((level - lowest <= _LIT * light).all())
+
+
+def pedestal(images: Float[np.ndarray, "*batch y x"]) -> tuple[float, float]:
+    """Highest level of images whose darkest corner is dark and uniform, and its part of the mean.
+
+    Both are 0 where light reaches all corners, or for less than 5 % of the mean light above it.
+    """
+    planes = images.reshape(-1, *images.shape[-2:])
+    side = min(planes.shape[1:]) // _CORNER // 2 * 2
+    if side < _SMALL:
+        return 0.0, 0.0
+    ends, found = (slice(None, side), slice(-side, None)), [(0.0, 0.0)]
+    for plane in planes:
+        dark = min((plane[row, column] for row in ends for column in ends), key=np.mean)
+        level, mean = dark.mean(dtype=float), plane.mean(dtype=float)
+        quarters = block_sum(dark, side // 2, float) * 4 / side**2
+        if level <= _PEDESTAL * (mean - level) or np.ptp(quarters) > _EVEN * level:
+            continue
+        if is_dark(plane[None], level.reshape(1, 1, 1), side):
+            found.append((float(level), float(level / mean)))
+    return max(found)

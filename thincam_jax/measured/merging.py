@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thincam_jax._core.grids import block_sum, central_blocks
+from thincam_jax.imaging.defects import is_dark
 from thincam_jax.measured.bayer import Pattern
 from thincam_jax.measured.examination import plateau
 from thincam_jax.measured.raw import MeasurementError, Raw
@@ -89,7 +89,6 @@ def _check(images: Sequence[Raw], signal: np.ndarray, seen: np.ndarray) -> None:
             )
 
 
-_LIT = 0.15  # largest part of the mean light that a dark place may hold
 _HOT = 8.0  # standard deviations of a dark frame
 _NEAR = np.add.outer(np.arange(5) % 2, np.arange(5) % 2) == 0  # one colour, also of a mosaic
 
@@ -141,20 +140,6 @@ def find_levels(
     levels = {"psf": lowest, "capture": np.zeros_like(lowest)}
     sources = {"psf": "lowest value", "capture": "found with the image"}
     return FoundLevels(levels, sources, squares[0])
-
-
-def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
-    """Whether a level is as low as the darkest square of an image (channel, y, x).
-
-    Above the darkest of all squares of `side` pixels, it lies by at most 15 % of what the mean of
-    the image does.
-    """
-    side = min(side, *image.shape[1:])
-    kept = image[:, *central_blocks(image.shape[1:], side)]
-    means = block_sum(kept, side, np.float64) / side**2
-    lowest = means.min(axis=(1, 2), keepdims=True)
-    light = means.mean(axis=(1, 2), keepdims=True) - lowest
-    return bool((level - lowest <= _LIT * light).all())
 
 
 def without_hot_pixels(raw: Raw, dark: Raw) -> tuple[Raw, Raw]:

@@ -1,6 +1,7 @@
 """Imaging models: cameras whose PSFs are computed, or PSFs that were measured."""
 
 import functools
+import logging
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -16,6 +17,7 @@ from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity, unchecked
+from thincam_jax.imaging.defects import pedestal
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank, Resampled
 from thincam_jax.imaging.scene import Spectrum
@@ -318,6 +320,10 @@ def _require_light(psfs: Array) -> None:
             f"a PSF sums to {light.min():.3g}, which is negative: too large a background was "
             "subtracted, or its sign is wrong; give PSFs of positive irradiance"
         )
+    level, share = pedestal(values)
+    if level > 0:
+        text = "a PSF is %.3g where it is dark, %.0f %% of its mean: give tc.Psfs(psfs - %.3g)"
+        logging.getLogger(__name__).warning(text, level, 100 * share, level)
 
 
 def registered_shape(shape: tuple[int, int], ratio: float) -> tuple[int, int]:
