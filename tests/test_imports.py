@@ -37,18 +37,15 @@ def imported_in_turn(*codes: str) -> list[set[str]]:
     return [set(line.split()) for line in lines]
 
 
-def test_the_package_alone_and_units_are_light():
-    for modules in imported_in_turn("import thincam_jax", "from thincam_jax.units import nm"):
-        assert modules.isdisjoint(SLOW)
-
-
 def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
     """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
-    modules, of_command = imported_in_turn(
-        "import thincam_jax as tc\n"
+    alone, units, modules, of_command = imported_in_turn(
+        "import thincam_jax as tc",
+        "from thincam_jax.units import nm",
         "tc.psf, tc.capture, tc.plan_capture, tc.choose_model, tc.reconstruct",
         "import thincam_jax.commands.reconstruct.run",
     )
+    assert alone.isdisjoint(SLOW) and units.isdisjoint(SLOW)
     assert "jax" in modules
     assert modules.isdisjoint(("matplotlib", "skimage", "jaxopt", "pydantic"))
     parts = ("fft", "ndimage", "optimize", "signal", "stats")
@@ -67,8 +64,13 @@ HELP = [
 
 
 def test_imports_leave_the_accelerator_to_others():
-    """A rig's process waits for hours beside those that compute."""
-    code = "from jax._src import xla_bridge\n"
+    """A rig's process waits for hours beside those that compute.
+
+    Documented paths are there without an import of their own.
+    """
+    paths = "imaging.operators.Matrix", "lensless.masks.phase.diffuser", "design.phase_mask"
+    code = "import thincam_jax as tc\n" + "".join(f"tc.{path}\n" for path in paths)
+    code += "from jax._src import xla_bridge\n"
     for name in ("hardware.virtual", "measured.calibration", "learn", "design", "studies"):
         code += f"import thincam_jax.{name}\n"
     imported_by(code + "assert not xla_bridge.backends_are_initialized()")
@@ -156,11 +158,6 @@ def test_a_name_that_is_not_there():
 def test_a_former_name_leads_to_the_one_of_today(package, name, nearest):
     with pytest.raises(AttributeError, match=rf"did you mean .*\b{nearest}\b"):
         getattr(package, name)
-
-
-def test_documented_paths_need_no_import_of_their_own():
-    paths = "imaging.operators.Matrix", "lensless.masks.phase.diffuser", "design.phase_mask"
-    imported_by("import thincam_jax as tc\n" + "\n".join(f"tc.{path}" for path in paths))
 
 
 def test_the_version_is_that_of_the_installation():

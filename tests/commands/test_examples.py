@@ -15,21 +15,21 @@ from thincam_jax.commands.kinds import load_experiment
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("kind", kinds.examples())
-def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
+def test_every_shipped_file_is_one_that_its_command_takes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result = call("init", kind)
-    assert result.exit_code == 0, result.output
-    command = kinds.read_kind(tmp_path / f"{kind}.yaml").command
-    assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
-    load_experiment(tmp_path / f"{kind}.yaml", command=command)
-
-
-def test_every_shipped_file_is_one(tmp_path):
     for kind in kinds.examples():
-        assert call("init", kind, "--out", tmp_path).exit_code == 0
+        result = call("init", kind)
+        assert result.exit_code == 0, result.output
+        command = kinds.read_kind(tmp_path / f"{kind}.yaml").command
+        assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
+        load_experiment(tmp_path / f"{kind}.yaml", command=command)
     assert len(kinds.examples()) == len(FILES)
-    assert {without_name(path) for path in tmp_path.iterdir()} == {without_name(p) for p in FILES}
+    (tmp_path / "folder").mkdir()
+    assert call("init", "study", "--out", tmp_path / "folder").exit_code == 0
+    assert (tmp_path / "folder/study.yaml").exists()
+    assert {without_name(path) for path in tmp_path.glob("*.yaml")} == {
+        without_name(p) for p in FILES
+    }
 
 
 def without_name(path):
@@ -47,7 +47,8 @@ def without_name(path):
 
 def kind_name(path):
     """The name of a file's kind."""
-    return next(name for name, kind in kinds.KINDS.items() if kind is kinds.read_kind(path))
+    found = kinds.read_kind(path)
+    return next(name for name, kind in kinds.KINDS.items() if kind is found)
 
 
 def test_the_page_of_commands_lists_them():

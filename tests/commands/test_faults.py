@@ -6,6 +6,7 @@ the schema that editors check with refuses it, too.
 """
 
 import ast
+import functools
 import inspect
 import textwrap
 from typing import Any, Literal, get_args, get_origin
@@ -60,9 +61,15 @@ def faults(section, raw, key):
     return [line.removeprefix(f"{place}: ") for line in lines if line.startswith(f"{place}: {key}")]
 
 
+@functools.cache
+def schema_of(section):
+    return section.model_json_schema()
+
+
+@functools.cache
 def word_of(section):
     """Words that are needed, and that other keys depend on."""
-    schema = section.model_json_schema()
+    schema = schema_of(section)
     needed = {key: schema["properties"][key] for key in schema.get("required", ())}
     return {
         key: form.get("const", form.get("enum", [None])[0])
@@ -110,7 +117,7 @@ def forms(form, defs):
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)
 def test_every_key_refuses_what_it_does_not_take(section):
-    schema = section.model_json_schema()
+    schema = schema_of(section)
     defs, tried = schema.get("$defs", {}), set()
     for key, form in schema.get("properties", {}).items():
         allowed, *paths = forms(form, defs)  # some sections may be the path of a file

@@ -19,29 +19,20 @@ SCHEMAS = ROOT / "configs/schemas"
 RESOLVED = json.loads((ROOT / "tests/commands/resolved.json").read_text("utf-8"))
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_resolved_values(path):
+def resolved(path):
     config = load_experiment(path, command=None)
     data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
     text = json.dumps(data).replace(str((ROOT / "configs").resolve()), "configs")
-    found = {key: value for key, value in json.loads(text).items() if key not in ("title", "notes")}
-    assert found == RESOLVED[path.stem]
+    return {key: value for key, value in json.loads(text).items() if key not in ("title", "notes")}
 
 
-@pytest.mark.parametrize("stem", RESOLVED)
-def test_files_of_this_version_are_read_by_later_ones(stem, tmp_path):
+@pytest.mark.parametrize("stem", sorted({*RESOLVED, *(path.stem for path in FILES)}))
+def test_resolved_values(stem, tmp_path):
     """What a run keeps of its experiment, with every default written out, means the same."""
+    assert resolved(ROOT / f"configs/{stem}.yaml") == RESOLVED[stem]
     written = json.dumps(RESOLVED[stem]).replace('"configs/', f'"{ROOT}/configs/')
     (tmp_path / "kept.yaml").write_text(written, "utf-8")
-    config = load_experiment(tmp_path / "kept.yaml", command=None)
-    data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
-    text = json.dumps(data).replace(str((ROOT / "configs").resolve()), "configs")
-    kept = {key: value for key, value in json.loads(text).items() if key not in ("title", "notes")}
-    assert kept == RESOLVED[stem]
-
-
-def test_every_file_is_recorded():
-    assert sorted(RESOLVED) == [path.stem for path in FILES]
+    assert resolved(tmp_path / "kept.yaml") == RESOLVED[stem]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -68,6 +59,7 @@ def test_schemas_of_the_shipped_files_are_those_of_the_command(kind):
 
 DESIGNS = [path.stem for path in FILES if path.stem.startswith("design")]
 STUDIES = ("flatcam", "fza_admm_tv", "fza_harmonics", "fza_slm_chart", "moving", "mura")
+RIGS = ("rig_pairs", "rig_phase")
 
 
 def but(*slow):
@@ -93,16 +85,11 @@ def options_of(path, folder):
     return []
 
 
-@but(
-    *DESIGNS,
-    *STUDIES,
-    "fza_field",
-    "fza_refocus",
-    "fza_superresolution",
-    "learned_refocus",
-    "sts_calibration",
-    "sts_colours",
-)
+FZA = ("fza_field", "fza_refocus", "fza_superresolution", "learned_refocus")
+STS = ("stis", "sts_calibration", "sts_colours")
+
+
+@but(*DESIGNS, *STUDIES, *RIGS, *FZA, *STS, "mosaic")
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", options_of(path, tmp_path)
     result = call(read_kind(path).command, path, "--out", out, "--dry-run", *options)
@@ -144,7 +131,7 @@ class TestExplain:
         assert rows["sensor.full_well: 13500.0"] == "default"
         assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
 
-    @but("design_slm", *STUDIES[:-1])
+    @but("design_slm", "design_distances", *STUDIES, *RIGS)
     def test_every_file(self, path, tmp_path):
         result = call("explain", path, *options_of(path, tmp_path))
         assert result.exit_code == 0, result.output
