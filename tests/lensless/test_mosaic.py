@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import finite_difference, relative_l2, value_and_slope
+from helpers import finite_difference, quick, relative_l2, value_and_slope
 from thincam_jax.lensless.masks.side_by_side import SideBySide
 from thincam_jax.units import nm, um
 
@@ -86,7 +86,7 @@ def test_pixels_average_the_interference_away():
     assert relative_l2(shadow, sum(shadows)) < 1e-9
 
 
-@pytest.mark.parametrize("wall", [0.1, pytest.param(None, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("wall", quick([0.1, None], 0))
 def test_parts_are_cameras_of_one_scene(wall):
     """A frame, split, is what the parts' cameras capture."""
     one = mosaic(wall)
@@ -97,7 +97,7 @@ def test_parts_are_cameras_of_one_scene(wall):
     assert relative_l2(one.join(one.split(frame)), frame) < (1e-9 if wall else 0.2)
 
 
-@pytest.mark.parametrize("wall", [0.1, None])
+@pytest.mark.parametrize("wall", quick([0.1, None], 0))
 def test_a_point_casts_each_mask_where_straight_lines_go(wall):
     """The shadows on the whole sensor of masks at their places; with walls, of each in its part."""
     one = mosaic(wall)
@@ -154,9 +154,7 @@ def test_spacers_change_the_distance_of_each():
     assert distances == [4.0, 4.5, 4.0, 5.0]
 
 
-@pytest.mark.parametrize(
-    "what", ["phase", *(pytest.param(w, marks=pytest.mark.thorough) for w in ("beta", "spacer"))]
-)
+@pytest.mark.parametrize("what", quick(["phase", "beta", "spacer"], 0))
 def test_gradients_are_those_of_finite_differences(what):
     weights = jnp.asarray(np.random.default_rng(1).normal(size=SENSOR.shape))
 

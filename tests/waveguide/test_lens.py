@@ -8,7 +8,7 @@ import pytest
 from waveguide.setting import camera, hologram
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.units import um
 from thincam_jax.waveguide import lens
@@ -71,7 +71,7 @@ def test_a_point_is_blurred_to_the_disc_of_geometry(monkeypatch, times, error):
     assert np.count_nonzero(expected > 0.1 * expected.max()) > 30  # a disc, not a point
 
 
-@pytest.mark.parametrize(("aperture", "focus"), [(2.0, 150.0), (4.0, 200.0)])
+@pytest.mark.parametrize(("aperture", "focus"), quick([(2.0, 150.0), (4.0, 200.0)], 1))
 def test_rings_that_are_taken_do_for_random_light(monkeypatch, aperture, focus):
     light = jnp.asarray(np.random.default_rng(0).uniform(size=PLANE.shape))
     made = behind_a_lens(aperture, focus)

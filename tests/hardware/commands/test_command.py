@@ -12,7 +12,7 @@ from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 from hardware.commands import tiny
 
-from helpers import read_fiducial, recipe
+from helpers import quick, read_fiducial, recipe
 from thincam_jax.hardware import registry
 from thincam_jax.hardware.acquisition.read import Acquisition
 from thincam_jax.hardware.commands import command
@@ -81,15 +81,7 @@ def test_a_matrix_of_captures_agrees_with_direct_simulation(light, tmp_path):
     np.testing.assert_allclose(np.sort(reduced.values)[-20:], values[19::-1], rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "devices",
-    [
-        pytest.param("zaber", marks=pytest.mark.thorough),
-        pytest.param("grbl", marks=pytest.mark.thorough),
-        "pylon",
-        "line",
-    ],
-)
+@pytest.mark.parametrize("devices", quick(["zaber", "grbl", "pylon", "line"], 2))
 def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, tmp_path):
     """By any camera and stage: the fiducials of the frames, read back from the store."""
     raw = yaml.safe_load(tiny.METHOD_B)

@@ -158,6 +158,7 @@ def memory() -> int:
 
 
 if __name__ == "__main__":
-    before = memory()
-    counts = {"parsers": parsers, "client": client, "xml": xml}[sys.argv[1]](int(sys.argv[2]))
-    print(*counts, memory() - before)
+    for what, count in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+        before = memory()
+        counts = {"parsers": parsers, "client": client, "xml": xml}[what](int(count))
+        print(*counts, memory() - before)
