@@ -2,12 +2,6 @@
 
 import importlib
 import itertools
-import json
-import os
-import subprocess
-import sys
-import textwrap
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +9,6 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import ROOT
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import convolution_cost, kernel_shape
 from thincam_jax.lensless.method import PsfMethod, psf_method
@@ -159,52 +152,3 @@ def test_convolutions(sensor, field, images, dtype):
         compiled = whole.lower(kernel, stack).compile()
         measured = allocated(compiled) + compiled.memory_analysis().argument_size_in_bytes
         require_agreement(measured, predicted)
-
-
-# What a fresh process is told to do. It compiles first and then looks: `VmRSS` is what is held
-# before the run, `VmHWM` the most ever held, and the run raises it by what it allocates at once.
-PROCESS = """
-    import importlib, json, sys
-    import jax, jax.numpy as jnp
-    import thincam_jax as tc
-    from thincam_jax.lensless.resolve import psf_cost
-    from thincam_jax.lensless.method import psf_method
-
-    def held(name):
-        lines = open("/proc/self/status").read().splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
-
-    model, n, average = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "average"
-    camera = tc.LenslessCamera(
-        tc.FresnelZoneAperture(25.0, width=5.632), tc.Sensor((n, n), 5.5e-3), 6.5
-    )
-    path, grid = camera.path(5e-4, 250.0), camera.sensor.grid
-    method = psf_method(camera.mask, grid, model, average)
-    psf = importlib.import_module("thincam_jax.lensless.psf")._psf
-    compiled = psf.lower(camera.mask, grid, path, method).compile()
-    before, most = held("VmRSS"), held("VmHWM")
-    jax.block_until_ready(compiled(camera.mask, grid, path))
-    cost = psf_cost(camera.mask, grid, method)
-    print(json.dumps([held("VmHWM") - before, cost.bytes, held("VmHWM") > most]))
-"""
-
-
-@pytest.mark.thorough
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
-@pytest.mark.parametrize(
-    ("model", "size", "kind"),
-    [("angular_spectrum", 1024, "points"), ("separable", 8192, "average")],
-)
-def test_peak_of_a_process(model, size, kind):
-    """The real peak, with whatever XLA allocates besides its own account (its FFTs' workspace).
-
-    Large enough that the compiler's memory, which the peak may hide in, is passed.
-    """
-    command = [sys.executable, "-c", textwrap.dedent(PROCESS), model, str(size), kind]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    measured, predicted, passed_compiler = json.loads(done.stdout)
-    assert passed_compiler
-    assert measured <= 1.5 * predicted
-    assert predicted <= 4 * measured

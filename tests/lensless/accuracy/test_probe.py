@@ -41,35 +41,6 @@ def value(case, model, **arguments):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    "case",
-    [
-        case_of((60, 100), 5.5e-3),  # the middle of the shadow
-        case_of((60, 100), 0.07, centre=(0.3, -0.9)),  # all of it, and round it
-        case_of((75, 120), 0.07, profile="binary"),
-        case_of((75, 120), 0.07, height=3.3),
-        case_of((256, 100), 0.02, average=True, object_distance=20.0),
-    ],
-    ids=["middle", "whole", "binary", "rectangle", "average"],
-)
-def test_small_images_are_known_exactly(case):
-    """All pairs of models, relative to the reference; and what single precision costs each."""
-    probe = probe_of(case)
-    images = {model: value(case, model) for model in CLOSED}
-    scale = np.linalg.norm(images["separable"])
-    for first in CLOSED:
-        for second in CLOSED:
-            true = np.linalg.norm(images[first] - images[second]) / scale
-            # The probe's own pixel average has twice the nodes.
-            rel = 1e-3 if case.conditions["pixel_integration"] else 1e-6
-            assert probe.difference(first, second) == pytest.approx(true, rel=rel, abs=1e-7)
-        rounded = value(case, PsfMethod(first, "float32"))
-        cost = np.linalg.norm(rounded - images[first]) / scale
-        assert cost <= probe.rounding(first, "float32") < 2 * cost + 5e-7
-    assert probe.difference("geometric", "separable") > 1e-3
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
     ("pitch", "distance", "average"),
     [(0.02, 6.5, False), (0.005, 1.0, False), (0.009, 30.0, False), (0.005, 6.5, True)],
 )

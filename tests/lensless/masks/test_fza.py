@@ -65,24 +65,6 @@ def test_binary_profile_is_its_truncated_series():
     assert sorted(orders.orders) == [k for k in range(-99, 100) if k % 2 or k == 0]
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("harmonics", [3, 9, 31])
-def test_intensity_profile_is_the_root_of_a_cosine(harmonics):
-    settings = {"width": 2.0, "profile": "intensity", "harmonics": harmonics}
-    mask = tc.FresnelZoneAperture(30.0, 0.7, **settings)
-    grid = tc.Grid((24, 31), 0.05)
-    r2 = centred(24, 0.05)[:, None] ** 2 + centred(31, 0.05) ** 2
-    irradiance = 0.5 * (1 + np.cos(30.0 * r2 + 0.7))
-    value = np.asarray(sample(mask, grid))
-    assert np.abs(value - np.sqrt(irradiance)).max() <= 2 / np.pi / (2 * harmonics + 1)
-    angle = 2 * np.pi * np.arange(4096) / 4096
-    series = np.fft.fft(np.abs(np.cos(angle / 2))).real / 4096
-    orders = mask.zone_orders()
-    assert orders.orders == mask.orders
-    turned = orders.coefficients * np.exp(-0.7j * np.array(orders.orders))
-    np.testing.assert_allclose(turned, series[list(orders.orders)], atol=1e-6)
-
-
 def test_display_pixels():
     """Each pixel shows the value at its centre over the open part √fill × √fill of its cell."""
     mask = tc.FresnelZoneAperture(30.0, 0.7, width=0.6, pixel_pitch=0.1, fill_factor=0.64)

@@ -8,7 +8,6 @@ from lensless.propagation import reference
 from lensless.propagation.reference import chirp, chirp_by_quadrature
 
 import thincam_jax as tc
-from helpers import finite_difference
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.closed_form import ChirpSum
 
@@ -69,74 +68,6 @@ def test_single_precision():
         assert value.dtype == np.complex64
         exact = chirp(*(v.astype(float) for v in single))
         assert np.abs(value - exact).max() / np.sqrt(np.pi / (g + B)) < 1e-3
-
-
-def weighted(*arguments):
-    """A real number from the complex integral in which both parts count."""
-    value = chirp_integral(*arguments)
-    return 0.6 * value.real - 0.8 * value.imag
-
-
-def at_64_points(function):
-    """Compile once for any number of points up to 64: the rest are filled with the first."""
-    compiled = jax.jit(function)
-
-    def call(*arguments):
-        count = len(arguments[0])
-        filled = [jnp.concatenate([v, jnp.full(64 - count, v[0])]) for v in arguments]
-        return jax.tree.map(lambda v: v[:count], compiled(*filled))
-
-    return call
-
-
-gradient = at_64_points(jax.vmap(jax.grad(weighted, argnums=(0, 1, 2, 3, 4))))
-values = at_64_points(weighted)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("x", [0.0, 0.21])
-def test_smooth_through_focus(x):
-    """Value and gradient do not feel a = 0; the slope there is that of differences across it."""
-    b, ends = 150.0, (-0.4, 0.6)
-    a = np.array([0.0, 1e-13, -1e-13, 1e-9, -1e-9, 1e-7, -1e-7])
-
-    def at(a):
-        return values(a - b, *(jnp.full(a.shape, v) for v in (b, x, *ends)))
-
-    value = np.asarray(at(jnp.asarray(a)))
-    across = finite_difference(at, jnp.zeros(1), jnp.ones(1), 0.02)[0]  # ξ² ≤ 0.36 rad per unit
-    np.testing.assert_allclose(value - value[0], across * a, rtol=0, atol=1e-11)
-    slopes = gradient(jnp.asarray(a) - b, *(jnp.full(a.shape, v) for v in (b, x, *ends)))
-    assert abs(across) > 1e-3
-    np.testing.assert_allclose(slopes[0], np.full(a.shape, across), rtol=1e-5 if x else 1e-6)
-    for slope in slopes:
-        np.testing.assert_allclose(slope, np.full(a.shape, slope[0]), rtol=1e-5)
-
-
-@pytest.mark.thorough
-def test_gradient_in_every_argument():
-    """Against differences, with z = 0 (the shadow's edge), a = 0 and every form among the points.
-
-    Each point has its own step: `rate` is how fast the phase under the integral turns with the
-    argument, so that rate·step = 0.003 for all (phases here stay under 1e3 rad: see
-    `finite_difference`). At z = 0 exactly the integral is smooth, and so is its Fresnel form.
-    """
-    cases = np.array([c for c in points() if c[1] < B])
-    g, b, x, lower, upper = cases.T
-    far = np.maximum(np.abs(lower), np.abs(upper))
-    reach = np.maximum(np.abs(x - lower), np.abs(x - upper))
-    size = scale_of(*cases.T)
-    end_rate = [2 * np.abs(g * e + b * (e - x)) + 1 / size for e in (lower, upper)]
-    rates = [far**2, reach**2, 2 * b * reach + 1.0, *end_rate]
-    exact = gradient(*jnp.asarray(cases).T)
-    for i, rate in enumerate(rates):
-        direction = [jnp.zeros(len(cases))] * 5
-        direction[i] = jnp.asarray(1 / rate)
-        slope = finite_difference(
-            lambda p: values(*p), tuple(jnp.asarray(v) for v in cases.T), tuple(direction), 0.003
-        )
-        error = np.abs(slope - exact[i] / rate) / size
-        assert error.max() < 2e-9, (i, cases[int(error.argmax())])
 
 
 WEIGHTS = np.array([0.4, 0.3 - 0.2j, -0.1 + 0.5j])

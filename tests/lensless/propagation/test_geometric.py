@@ -53,38 +53,6 @@ def test_rectangle():
     assert np.abs(found - average).mean() < 2e-3
 
 
-@pytest.mark.thorough
-def test_is_the_limit_of_short_waves():
-    """The error falls like √λ: what is left are the waves of the edges, √(λd)/(2π·distance).
-
-    No pixel centre lies nearer to the edge of the shadow (0.625 ± the centre's shift) than 4 µm,
-    and √(λd) is under that from the first wavelength on.
-    """
-    errors = []
-    expected = psf_of((12, 17), 0.1)
-    for wavelength in (1e-7, 1e-8, 1e-9):
-        h = psf_of((12, 17), 0.1, model="separable", wavelength=wavelength)
-        errors.append(np.abs(h - expected).max())
-    ratios = np.divide(errors[:-1], errors[1:])
-    assert np.all((ratios > 2.2) & (ratios < 4.5)), (errors, ratios)  # √10 = 3.2
-    assert errors[-1] < 5e-3
-
-
-@pytest.mark.thorough
-def test_pixel_average():
-    """Against 200×200 midpoints a pixel; width and centre put the edges between midpoints."""
-    shape, pitch, t, width = (11, 14), 0.125, 20.0, 1.0
-    m = 1 + 5.0 / t
-    sub = (np.arange(200) - 99.5) / 200 * pitch
-    y, x = ((reference.centred(n, pitch)[:, None] + sub).ravel() for n in shape)
-    expected = shadow(y, x, width).reshape(11, 200, 14, 200).mean(axis=(1, 3))
-    edges = (np.array([-0.5, 0.5]) + CENTRE[0]) * m / pitch * 200
-    np.testing.assert_allclose(edges, np.round(edges), atol=1e-9)
-    value = psf_of(shape, pitch, average=True)
-    np.testing.assert_allclose(value, expected, rtol=0, atol=2e-5)
-    assert np.abs(psf_of(shape, pitch) - expected).max() > 0.1
-
-
 def test_binary_profile():
     """|Σ c_k e^{jk(βr²+φ)}|² of the truncated series itself, zone by zone."""
     y, x = (reference.centred(n, 0.031) for n in (20, 27))

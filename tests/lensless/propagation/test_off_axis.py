@@ -90,7 +90,7 @@ def _field(mask, path, points):
 @pytest.mark.parametrize(
     ("angle", "azimuth", "distance", "every"),
     [
-        (20, 0, INF, 2),
+        (20, 0, INF, 3),
         pytest.param(20, 45, INF, 1, marks=pytest.mark.thorough),
         pytest.param(30, 45, 60.0, 1, marks=pytest.mark.thorough),
     ],
@@ -103,26 +103,6 @@ def test_closed_form_against_the_direct_sum(angle, azimuth, distance, every):
     error = relative(own, exact)
     assert error < 0.06
     assert error < relative(axis, exact) / 2
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("azimuth", [0, 30, 45])
-@pytest.mark.parametrize(("angle", "most"), [(20, 0.005), (30, 0.01)])
-def test_averages_over_pixels_are_within_a_percent(angle, most, azimuth):
-    """β = 25 rad/mm², d = 6.5 mm, against the angular spectrum; the axis' PSF is 4 and 11 % off."""
-    tangent = tangents(angle, azimuth)
-    sensor, light = tc.Sensor((64, 96), 22 * um), {"wavelength": 500 * nm, "at": tangent}
-
-    def camera(centre):
-        mask = tc.FresnelZoneAperture(25.0, 0.4, width=2.0, height=1.2, centre=centre)
-        return tc.LenslessCamera(mask, sensor, 6.5)
-
-    moved = camera(tuple(6.5 * tangent))
-    sampled = tc.PsfMethod("angular_spectrum", oversampling=9)
-    exact = tc.psf(moved, model=sampled, pixel_integration=True, **light)
-    assert relative(tc.psf(moved, pixel_integration=True, **light), exact) < most
-    on_axis = tc.psf(camera((0.0, 0.0)), wavelength=500 * nm, pixel_integration=True)
-    assert relative(on_axis, exact) > 5 * most
 
 
 def about_ray(camera, angle, azimuth, model, samples=None, averaged=False, **method):
@@ -241,11 +221,11 @@ def test_averages_are_means_over_points_of_a_pixel(pitch, most):
     """Of 80 × 80 in each."""
     tangent = tangents(30, 40)
     mask = plate(tuple(DISTANCE * tangent))
-    sensor = tc.Sensor((6, 8), pitch)
+    sensor = tc.Sensor((3, 4), pitch)
     light = {"wavelength": 500 * nm, "at": tangent}
     found = tc.psf(tc.LenslessCamera(mask, sensor, DISTANCE), pixel_integration=True, **light)
-    fine = tc.LenslessCamera(mask, tc.Sensor((480, 640), pitch / 80), DISTANCE)
-    exact = np.asarray(point_psf(fine, **light)).reshape(6, 80, 8, 80).mean((1, 3))
+    fine = tc.LenslessCamera(mask, tc.Sensor((240, 320), pitch / 80), DISTANCE)
+    exact = np.asarray(point_psf(fine, **light)).reshape(3, 80, 4, 80).mean((1, 3))
     assert relative(np.asarray(found), exact) < most
 
 

@@ -146,6 +146,15 @@ def test_choice_meets_the_tolerance():
     assert relative_l2(single, exact) < 1e-4
 
 
+def test_other_masks_and_shapes_are_refused():
+    camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((3, 4), 0.1), 5.0)
+    assert camera.mask.exact_model == "separable"
+    with pytest.raises(TypeError, match="'radial' needs a RadialMask; for a Pinhole use 'sepa"):
+        psf(camera)
+    with pytest.raises(ValueError, match=r"ring has shape \(2,\); give one width, or one for ea"):
+        tc.RadialMask([1.0, 0.0, 1.0], [0.1, 0.2])
+
+
 @pytest.mark.thorough
 def test_gradients_in_every_number():
     """d, λ, t, values and widths of rings and their place, on and off the shadow's rims."""
@@ -163,12 +172,3 @@ def test_gradients_in_every_number():
     for i in range(len(start)):
         expected = finite_difference(value, start, jnp.zeros(len(start)).at[i].set(1.0), 1e-6)
         np.testing.assert_allclose(found[i], expected, rtol=1e-5, atol=1e-5)
-
-
-def test_other_masks_and_shapes_are_refused():
-    camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((3, 4), 0.1), 5.0)
-    assert camera.mask.exact_model == "separable"
-    with pytest.raises(TypeError, match="'radial' needs a RadialMask; for a Pinhole use 'sepa"):
-        psf(camera)
-    with pytest.raises(ValueError, match=r"ring has shape \(2,\); give one width, or one for ea"):
-        tc.RadialMask([1.0, 0.0, 1.0], [0.1, 0.2])

@@ -1,19 +1,14 @@
 """The exact PSF of the square aperture, against evaluations that share nothing with it."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.integrate
-from lensless.accuracy.cameras import pixel_average
 from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.method import PIXEL_NODES, average_error, pixel_nodes
-from thincam_jax.lensless.propagation.separable import separable
 
 INF = float("inf")
 THESIS = {"beta": 25.0, "width": 5.632, "distance": 6.5, "wavelength": 500e-6}
@@ -120,20 +115,6 @@ def test_display_pixels():
     assert relative_l2(value, np.abs(field) ** 2) < 1e-12
 
 
-@pytest.mark.thorough
-def test_binary_profile():
-    """Orders up to 5, their coefficients from quadrature of the open half of each period."""
-    value = psf_of((24, 31), 0.025, SMALL, 60.0, phase=0.9, profile="binary", harmonics=5)
-    orders = {
-        k: scipy.integrate.quad(lambda a, k=k: np.cos(k * a), -np.pi / 2, np.pi / 2)[0] / 2 / np.pi
-        for k in range(-5, 6)
-    }
-    expected = reference.psf(
-        *coordinates((24, 31), 0.025), orders=orders, phase=0.9, object_distance=60.0, **SMALL
-    )
-    assert relative_l2(value, expected) < 1e-12
-
-
 @pytest.mark.parametrize(
     ("geometry", "pitch", "centre", "tolerance"),
     [
@@ -162,28 +143,6 @@ def test_pixel_average(geometry, pitch, centre, tolerance):
     assert relative_l2(value, expected) < tolerance
     point_sampled = psf_of(shape, pitch, geometry, 80.0, phase=0.3, centre=centre)
     assert relative_l2(point_sampled, expected) > 20 * tolerance
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("object_distance", [INF, 40.0])
-def test_energy(object_distance):
-    """What passes the mask arrives: Σ h pitch²/M² = ∬ |t|² dx dy.
-
-    The sum samples |U|², whose band ends at width/(λd) = 50 cycles/mm·(1/M), under 1/pitch: it is
-    the integral. Outside ±L lies, per axis, the part λd/(Mπ²Lw)·M = 3.4e-4 of the light of a bare
-    aperture; the zones at the edge are brighter by up to 1/⟨t²⟩ = 8/3 than the mean, so the bound
-    is 2·(8/3)·3.4e-4 = 1.8e-3.
-    """
-    half, pitch = 6.0, 0.0182
-    shape = (int(2 * half / pitch), int(2 * half / pitch) + 1)
-    value = psf_of(shape, pitch, SMALL, object_distance, phase=0.3)
-    magnification = 1 + SMALL["distance"] / object_distance
-    arrived = value.sum() * pitch**2 / magnification**2
-    x = reference.centred(1000, SMALL["width"] / 1000)
-    passed = (
-        np.mean(np.cos((200.0 * (x[:, None] ** 2 + x**2) + 0.3) / 2) ** 4) * SMALL["width"] ** 2
-    )
-    assert 0 < 1 - arrived / passed < 1.8e-3
 
 
 def test_pixel_nodes_follow_the_fringes_in_a_pixel():
@@ -223,45 +182,3 @@ def test_more_nodes_follow_more_fringes_or_leave_a_tolerance():
         assert (average_error(*given, nodes) == 0) == (nodes < 320)
         assert average_error(*given, 12) > average_error(*given, 20) > 0
     assert found == [32, 48, 96, 320]
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("distance", [0.05, 0.2, 2.3])
-def test_averages_of_coarse_pixels_near_the_mask(distance):
-    """Against pixels in pieces; 24 nodes were 3 % off at 0.05 mm. Of light, all arrives."""
-    mask = tc.FresnelZoneAperture(60.0, 0.4, width=1.0, height=0.8)
-    camera = tc.LenslessCamera(mask, tc.Sensor((9, 12), 0.3), distance)
-    found = tc.psf(camera, wavelength=500e-6, pixel_integration=True)
-    geometry = {"beta": 60.0, "width": 1.0, "height": 0.8, "distance": distance}
-    geometry |= {"wavelength": 500e-6, "object_distance": INF, "phase": 0.4, "centre": (0, 0)}
-    exact = pixel_average((9, 12), 0.3, orders=reference.COSINE, **geometry)
-    assert relative_l2(found, exact) < 2e-3
-    near = dataclasses.replace(camera, distance=4e-7)
-    lit, shadow = (
-        float(jnp.sum(tc.psf(near, wavelength=500e-6, pixel_integration=True, model=model)))
-        for model in ("separable", "geometric")
-    )
-    assert lit == pytest.approx(shadow, rel=2e-3)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("width", [0.4, 0.9, 1.8, 3.0])
-def test_fewer_nodes_are_as_exact(width):
-    """In single precision below its rounding, in double 1e-11, against all 24."""
-    camera = camera_of((24, 31), PITCH, THESIS | {"width": width})
-    path = camera.path(500e-6, 80.0)
-    exact, *rest = (
-        separable(
-            camera.mask, camera.sensor.grid, path, pixel_integration=True, nodes=nodes
-        ).image()
-        for nodes in (
-            PIXEL_NODES,
-            *(
-                pixel_nodes(camera.mask, camera.sensor.grid, path, p)
-                for p in ("float32", "float64")
-            ),
-        )
-    )
-    single, double = (relative_l2(np.asarray(value), np.asarray(exact)) for value in rest)
-    assert single < 1e-7
-    assert double < 1e-11

@@ -81,35 +81,6 @@ def test_against_quadrature(object_distance, kind):
     np.testing.assert_allclose(value[0, 0], light, rtol=1e-5)
 
 
-@pytest.mark.thorough
-def test_against_the_transform_of_the_psf():
-    """The sampled transform differs by the tails beyond its grid: 1.2e-3, half with twice the grid.
-
-    The PSF falls off as the square of the distance from the edge along each axis, so that what lies
-    outside ±L is as 1/L.
-    """
-    path = LightPath(WAVELENGTH, DISTANCE, 60.0)
-    errors = []
-    for half in (2.5, 5.0, 10.0):
-        pitch = 0.0125
-        camera = tc.LenslessCamera(
-            mask_of(),
-            tc.Sensor((int(2 * half / pitch), int(2 * half / pitch) + 1), pitch),
-            DISTANCE,
-        )
-        h = np.asarray(
-            tc.psf(camera, wavelength=WAVELENGTH, object_distance=60.0, pixel_integration=False)
-        )
-        y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in h.shape)
-        u = np.linspace(0.0, 20.0, 21)
-        waves = [np.cos(2 * np.pi * np.outer(u[: 21 - 4 * i], c)) for i, c in enumerate((y, x))]
-        sampled = waves[0] @ h @ waves[1].T * pitch**2
-        errors.append(relative_l2(sampled, response(mask_of(), path, u, u[:17])))
-    assert errors[0] < 5e-3
-    assert errors[2] < 0.35 * errors[0]
-    assert errors[0] > errors[1] > errors[2]
-
-
 def test_single_precision():
     """Relative L2 at the thesis' size, up to 45 cycles/mm; measured 4e-6."""
     u = np.linspace(0, 45, 60)
