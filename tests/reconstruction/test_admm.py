@@ -15,7 +15,6 @@ from helpers import count_traces, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape, window_shape
 from thincam_jax.reconstruction.admm import AdmmMethod, Penalties, admm_map, consensus
-from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import InverseProblem, objective
 from thincam_jax.reconstruction.splittings import admm_method, splitting_of
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -224,30 +223,6 @@ def test_extremes_are_finite():
     assert bool(jnp.isfinite(free).all()) and 0 < float(jnp.ptp(flat)) < 0.2 * float(jnp.ptp(free))
 
 
-def driven(problem, *, iterations=1500, tolerance=1e-9, image=None, **settings):
-    method = admm_method(problem, relaxation=settings.pop("relaxation", 1.7))
-    image = jnp.zeros(problem.image_shape, problem.tau.dtype) if image is None else image
-    settings = {"adapt_until": iterations // 2} | settings
-    return iterate(method, image, Schedule(iterations, tolerance, **settings))
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["colour_anisotropic", "planes"])
-def test_it_converges_to_the_minimum_of_another_method(name):
-    """With its own penalties, which start 10 times too large for these problems and adapt."""
-    given = case(name)
-    outcome = driven(given.problem, iterations=4000)
-    expected = reference(given)
-    assert outcome.status == "converged"
-    assert relative_l2(np.asarray(outcome.image).reshape(expected.shape), expected) < 1e-6
-    assert energy(given, outcome.image) == pytest.approx(energy(given, expected), rel=1e-9)
-    # the history is that of the objective, and ends at the lowest
-    last, values = outcome.history[-1], [p.objective for p in outcome.history]
-    assert values[-1] == pytest.approx(energy(given, expected), rel=1e-9)
-    assert min(values) >= energy(given, expected) * (1 - 1e-9)
-    assert max(last.primal, last.dual) < 1e-9
-
-
 def test_residuals_are_what_their_names_say():
     """Primal: Kf − z against the larger of the two; dual: how far z moved, against the forces."""
     problem, _ = scenes.problem()
@@ -286,23 +261,6 @@ def test_residuals_are_what_their_names_say():
     assert len(found.parts) == 3 and all(p > 0 and d > 0 for p, d in found.parts)
     # what ends a fixed point: the move of the plain map, relative to the state
     assert float(state.inside.change) == pytest.approx(size(gap) / size(before), rel=1e-10)
-
-
-@pytest.mark.thorough
-def test_balance_moves_penalties_the_right_way():
-    """From penalties far too large or too small, ten times nearer to the minimum with balance."""
-    given = case("colour")
-    lowest = energy(given, reference(given))
-    for factor in (300.0, 1 / 300.0):
-        bad = weighed(given.problem, (factor,) * 3).penalties
-        splitting = splitting_of(given.problem).with_penalties(bad)
-        method = AdmmMethod(given.problem, splitting, 1.5)
-        first = jnp.zeros(given.problem.image_shape)
-        errors = []
-        for until in (0, 150):
-            run = iterate(method, first, Schedule(300, 0.0, adapt_until=until))
-            errors.append(energy(given, run.image) / lowest - 1)
-        assert errors[1] < 0.1 * errors[0]
 
 
 def test_balanced_penalties_keep_the_image():

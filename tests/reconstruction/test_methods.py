@@ -209,28 +209,6 @@ def noisy(count=2, noise=0.005):
 
 
 @pytest.mark.thorough
-def test_total_variation_is_upright_and_nearer_than_the_filter():
-    """Two noisy captures with their bright backgrounds, which the sensor crops."""
-    seen, picture = noisy(), rig.picture()
-    history = []
-    cameras = rig.imaging_model(rig.pair())
-    result = variation(seen, cameras, callback=history.append)
-    assert result.method == "admm_tv" and result.reason == ""
-    assert result.status in ("converged", "iterations_exhausted")
-    assert result.image.shape == rig.FIELD and float(result.image.min()) >= 0
-    assert rig.correlation(result.image, picture) > 0.99
-    assert rig.correlation(result.image[::-1, ::-1], picture) < 0.5
-    scale = np.vdot(result.image, picture) / np.vdot(picture, picture)
-    assert scale == pytest.approx(1.0, abs=0.05)
-    assert float(result.pitch) == pytest.approx(rig.OBJECT_PITCH)
-    assert tuple(history) == result.history[1:] and result.iterations == history[-1].iteration
-    error = float(jnp.linalg.norm(result.image - picture))
-    recording = tc.Recording(seen, cameras, noise_variance=(0.005 * 0.19) ** 2)
-    filtered = tc.reconstruct(recording, tc.Wiener())
-    assert error < float(jnp.linalg.norm(filtered.image - picture))
-
-
-@pytest.mark.thorough
 def test_a_warm_start_is_given_upright_and_converges_sooner():
     """For cameras and for PSFs; what is given is the image that was returned."""
     psfs = tc.Psfs(jnp.asarray(rig.picture((9, 10)))[None], field_shape=(31, 32))

@@ -12,11 +12,10 @@ from scipy import signal
 
 import thincam_jax as tc
 from helpers import quick
-from thincam_jax.imaging.operators import CropConvolution, Masked, Matrix, Separable, Stacked
-from thincam_jax.imaging.operators.masked import Scaled
+from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable, Stacked
 from thincam_jax.reconstruction import InverseProblem
 from thincam_jax.reconstruction.iterate import Outcome
-from thincam_jax.reconstruction.problem import residuals, total_misfit, total_objective
+from thincam_jax.reconstruction.problem import residuals, total_misfit
 
 SENSOR, FIELD = tc.Sensor((52, 61), rig.SENSOR.pitch), (28, 33)
 RNG = np.random.default_rng(8)
@@ -76,24 +75,6 @@ def test_sums_of_captures_take_sums_of_kernels():
     np.testing.assert_allclose(problem.captures[1][0], 2 * (seen[1] - seen[3]), rtol=1e-12)
     for weight, variance in zip(problem.weights, (1 + 3, 4 * (2 + 4)), strict=True):
         np.testing.assert_allclose(weight, 1 / variance, rtol=1e-12)
-
-
-@pytest.mark.thorough
-def test_two_distances_are_registered():
-    """Method A: the nearer camera's capture enlarged; what lies beyond its rim is not used."""
-    image = rig.picture(FIELD)
-    rigs = cameras(1, distance=3.0) + cameras(1, distance=2.4)
-    seen = rig.captures(rigs, image)
-    problem = camera_problem(seen, rigs)
-    assert problem.captures[1].shape[-2:] == (66, 77)  # 52·1.25 = 65, 61·1.25 = 76.25
-    assert share(problem, projected(image))[0] < 1e-6
-    assert share(problem, projected(image))[1] < 0.01
-    trusted = np.asarray(problem.weights[1])[0] > 0
-    assert trusted[2:-2, 2:-2].all() and bool((problem.weights[0] > 0).all())
-    # beyond the rim the capture is dark, the model is not
-    value = compiled_residuals(problem, projected(image))[1] + problem.captures[1]
-    beyond = np.asarray(problem.captures[1][0])[~trusted]
-    assert beyond.size > 60 and not beyond.any() and np.asarray(value[0])[~trusted].min() > 1e-3
 
 
 @pytest.mark.thorough
@@ -279,32 +260,6 @@ def test_operators_with_captures_of_any_shape():
             result = recording.reconstruction(outcome, "admm_tv")
             np.testing.assert_array_equal(result.image, np.reshape(image, (*batch, 4, 5)))
             assert result.pitch is None
-
-
-@pytest.mark.thorough
-def test_masks_and_gains_of_operators_are_those_of_the_recording():
-    """Before or around a stack, or said by the recording: one problem."""
-    operators, shapes = [matrix(30), matrix(12, seed=4)], [(30,), (12,)]
-    captures = [jnp.asarray(RNG.uniform(size=s)).at[3].set(jnp.nan) for s in shapes]
-    masks = [jnp.ones(s, bool).at[3].set(False) for s in shapes]
-    inside = [Masked(o, m) for o, m in zip(operators, masks, strict=True)]
-    problems = [
-        tc.Recording(captures, imaging_model, noise_variance=[1.0, 4.0], valid=valid).problem()
-        for imaging_model, valid in (
-            (operators, masks),
-            (inside, None),
-            (Stacked(inside), None),
-            (Masked(Stacked(operators), tuple(masks)), None),
-        )
-    ]
-    doubled = [2 * c for c in captures]
-    scaled = Scaled(Masked(Stacked(operators), tuple(masks)), 2.0)
-    problems.append(tc.Recording(doubled, scaled, noise_variance=[4.0, 16.0]).problem())
-    image = jnp.asarray(RNG.uniform(size=(1, 1, 4, 5)))
-    first = total_objective(image, problems[0])
-    assert bool(jnp.isfinite(first))
-    for other in problems[1:]:
-        assert float(total_objective(image, other)) == pytest.approx(float(first), rel=1e-12)
 
 
 def test_the_constructor_refuses_what_no_method_takes():

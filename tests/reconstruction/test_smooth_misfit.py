@@ -4,13 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
-import skimage
 
-import thincam_jax as tc
-from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution, Matrix
-from thincam_jax.imaging.targets import resize
-from thincam_jax.reconstruction import InverseProblem, smooth_misfit
+from thincam_jax.reconstruction import InverseProblem
 from thincam_jax.reconstruction.problem import residuals
 from thincam_jax.reconstruction.smooth_misfit import misfit_of
 from thincam_jax.reconstruction.uniform_light import window_length
@@ -73,32 +69,3 @@ def test_other_operators_have_none():
     matrix = Matrix(jnp.asarray(RNG.random((9, 12))), (3, 4), (9,))
     problem = InverseProblem([matrix], [RNG.random((1, 9))])
     assert misfit_of(problem, jnp.zeros(problem.image_shape)) is None
-
-
-@pytest.mark.thorough
-def test_a_shaded_capture_gains(monkeypatch):
-    """MURA-31 with 10 % of shading, 30 dB: the reason is said, and the image is the better."""
-    picture = resize(skimage.img_as_float(skimage.data.camera()), (96, 96))
-    mask = tc.ModifiedUniformlyRedundantArray(31, 0.18)
-    camera = tc.LenslessCamera(mask, tc.Sensor((192, 192), 0.03), 3.0)
-    optics = tc.Cameras([camera], wavelength=5e-4, object_distance=100.0, field_shape=(96, 96))
-    blank = tc.Recording(np.zeros((1, 192, 192)), optics, noise_variance=1.0).problem()
-    seen = jnp.asarray(picture[::-1, ::-1].copy())[None, None]
-    light = np.asarray(blank.operators[0](seen))[0]
-    y, x = np.meshgrid(*[np.linspace(-1, 1, 192)] * 2, indexing="ij")
-    noise = light.std() * 10**-1.5 * RNG.standard_normal(light.shape)
-    shaded = light * (1 + 0.1 * (np.sin(1.7 * y + 0.3) + 0.7 * np.cos(2.9 * x - 1)))
-    result = tc.reconstruct(tc.Recording([shaded + noise], optics), tc.AdmmTV())
-    assert "shading" in result.reason and result.status == "converged"
-    clean = tc.reconstruct(tc.Recording([light + noise], optics), tc.AdmmTV())
-    assert clean.reason == ""
-    monkeypatch.setattr(smooth_misfit, "_MISFIT", np.inf)
-    plain = tc.reconstruct(tc.Recording([shaded + noise], optics), tc.AdmmTV())
-
-    def error(image):
-        design = np.stack([np.ravel(image), np.ones(picture.size)], axis=1)
-        fit = design @ np.linalg.lstsq(design, picture.ravel(), rcond=None)[0]
-        return relative_l2(fit, picture.ravel())
-
-    assert error(result.image) < 0.7 * error(plain.image)
-    assert error(clean.image) < error(result.image)
