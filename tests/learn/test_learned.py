@@ -1,6 +1,5 @@
 """Networks in files and in use: trained, gone on with, loaded for their camera and no other."""
 
-import dataclasses
 import re
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from thincam_jax.learn.refocusing.learned import Learned, doubt
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.sources import as_json, dead_leaves
 from thincam_jax.learn.refocusing.store import KIND, SHIPPED, SHIPPED_FILE
-from thincam_jax.learn.refocusing.train import NETWORK, STATE, train
+from thincam_jax.learn.refocusing.train import NETWORK
 from thincam_jax.units import nm
 
 
@@ -42,30 +41,6 @@ def test_a_network_comes_back_for_its_camera(file):
         found = RefocusNetwork.load(file, given)
         assert eqx.tree_equal(found.weights, tiny.network().weights)
     assert eqx.tree_equal(found.planes.operator, tiny.network().planes.operator)
-
-
-@pytest.mark.thorough
-def test_training_goes_on_to_the_same_bits(tmp_path):
-    given = tiny.network(), tiny.lessons(), tiny.TRAINING
-    whole = train(*given)
-    stopped = train(*given, folder=tmp_path, callback=lambda progress: progress.step == 3)
-    assert stopped.status == "stopped" and (tmp_path / STATE.format(1)).exists()
-    resumed = train(*given, folder=tmp_path)
-    assert resumed.status == "finished" and whole.state.skipped == 0
-    assert eqx.tree_equal(resumed.state, whole.state)
-    assert not eqx.tree_equal(whole.model.weights, tiny.network().weights)
-    assert eqx.tree_equal(whole.model.planes, tiny.network().planes)
-    found = RefocusNetwork.load(tmp_path / NETWORK, tiny.camera())
-    assert eqx.tree_equal(found.weights, whole.model.weights)
-    told = network_description(tmp_path / NETWORK, KIND)["training"]
-    assert told["steps"] == 4 and len(told["scores"]) == 2
-    # As often as nothing is left to be done.
-    assert eqx.tree_equal(train(*given, folder=tmp_path).state, whole.state)
-    other = dataclasses.replace(tiny.TRAINING, rate=1.0)
-    with pytest.raises(CheckpointError, match=r"whose training\.rate was 0\.003 and is 1\.0 here"):
-        train(tiny.network(), tiny.lessons(), other, folder=tmp_path)
-    with pytest.raises(CheckpointError, match="holds no refocusing network"):
-        RefocusNetwork.load(tmp_path / STATE.format(1), tiny.camera())
 
 
 @pytest.mark.thorough

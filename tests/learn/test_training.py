@@ -1,12 +1,6 @@
 """Training: it learns, survives NaN, goes on to the same bits; and a learned τ."""
 
 import dataclasses
-import os
-import random
-import signal
-import subprocess
-import sys
-import time
 
 import equinox as eqx
 import jax
@@ -15,7 +9,6 @@ import numpy as np
 import pytest
 from reconstruction.test_choose_tau import posed, solved
 
-from helpers import ROOT
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.tau import learn_tau
 from thincam_jax.learn.training import (
@@ -128,48 +121,6 @@ def test_what_never_becomes_a_number_ends_with_the_best_so_far():
     assert trained.status == "diverged" and trained.state.skipped == 15
     found = float(loss(trained.model, TASK.validation[0])[0])
     assert found == pytest.approx(trained.state.scores[0])
-
-
-CHILD = """
-import time, sys
-from learn import test_training as t
-from pathlib import Path
-file = Path(sys.argv[1])
-begun = t.TrainingState.begin(t.MODEL, t.TASK, t.OPTIONS)
-print("begins", flush=True)
-def keep(state):
-    t.write_state(file, state, t.SETTINGS)
-    print(state.step, flush=True)
-t.train_model(t.TASK, t.MODEL, t.OPTIONS, keep=keep, callback=lambda _: time.sleep(0.005))
-"""
-
-
-def killed_and_resumed(file, checks, delay):
-    """The end of a training whose process was killed some time after so many checks."""
-    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
-    env |= {"JAX_ENABLE_X64": "1", "JAX_NUMPY_DTYPE_PROMOTION": "strict"}
-    command = [sys.executable, "-c", CHILD, file]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=env) as child:
-        assert child.stdout is not None
-        for _ in range(1 + checks):
-            assert child.stdout.readline()
-        time.sleep(delay)
-        child.send_signal(signal.SIGKILL)
-    begun = state = TrainingState.begin(MODEL, TASK, OPTIONS)
-    if file.exists():
-        state = read_state(file, begun, SETTINGS)
-        assert state.step >= 10 * checks
-    return train_model(TASK, MODEL, OPTIONS, state=state).state
-
-
-@pytest.mark.thorough
-def test_a_process_killed_at_twenty_moments_goes_on_to_the_same_bits(tmp_path):
-    whole, moments = train_model(TASK, MODEL, OPTIONS).state, random.Random(3)
-    for number in range(20):
-        found = killed_and_resumed(
-            tmp_path / f"state-{number}", moments.randrange(4), moments.uniform(0, 0.08)
-        )
-        assert eqx.tree_equal(found, whole)
 
 
 @pytest.mark.thorough

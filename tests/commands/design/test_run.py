@@ -41,15 +41,6 @@ def whole(tmp_path_factory):
     return home / "out", stored(home / "out"), result.stdout
 
 
-@pytest.mark.thorough
-def test_in_memory_it_is_the_same(whole, tmp_path):
-    result = tiny.built(tmp_path, *QUICK).run()
-    assert result.scores == whole[1]
-    assert len(result.table().rows) == 2
-    labels = [text.get_text() for text in result.plot().axes[0].get_legend().get_texts()]
-    assert [label.split(" (")[0] for label in labels] == ["pairs", "found 1"]
-
-
 def test_found_designs_are_better_and_within_bounds(whole):
     design = whole[1]
     reference, found = design.reference, design.found

@@ -3,13 +3,7 @@
 import contextlib
 import csv
 import json
-import os
-import random
 import re
-import signal
-import subprocess
-import sys
-import time
 import warnings
 
 import numpy as np
@@ -18,7 +12,6 @@ import pytest
 from commands.reconstruct import simulated
 from commands.test_cli import call, one_line
 
-from helpers import ROOT
 from thincam_jax.commands.evaluate import pair, run
 from thincam_jax.commands.evaluate.config import EvaluationConfig
 from thincam_jax.commands.evaluate.pair import opened, reconstructed
@@ -315,34 +308,3 @@ def test_info(folder):
         assert part in text
     wrong = call("dataset", "info", folder / "truths")
     assert "known layouts are: " in one_line(wrong)
-
-
-@pytest.mark.thorough
-def test_500_pairs_killed_ten_times(tmp_path):
-    """The same table as of an evaluation that was not killed, by worker processes."""
-    folder = write_pairs(tmp_path / "set", 500, (24, 32))
-    command = "from thincam_jax.commands.start import main; main()"
-    options = ["--method", "ridge", "--workers", "2", "--quiet", "--iterations", "30"]
-    chance = random.Random(0)
-
-    def begin(out):
-        arguments = [sys.executable, "-c", command, "evaluate", str(folder), "--out", str(out)]
-        where = {**os.environ, "PYTHONPATH": str(ROOT)}
-        return subprocess.Popen([*arguments, *map(str, LINEAR), *options], env=where)
-
-    assert begin(tmp_path / "whole").wait() == 0
-    killed, kept = tmp_path / "killed", []
-    for part in range(10):
-        process = begin(killed)
-        while process.poll() is None and len(list(killed.glob("pairs/*/*.json"))) < 40 * (part + 1):
-            time.sleep(0.02)
-        time.sleep(chance.uniform(0, 0.3))
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        kept.append(len(list(killed.glob("pairs/*/*.json"))))
-    assert kept == sorted(kept) and kept[-1] < 500
-    assert begin(killed).wait() == 0
-    assert rows_of(killed) == rows_of(tmp_path / "whole")
-    intervals = [tmp_path / name / "intervals/ridge.json" for name in ("killed", "whole")]
-    assert intervals[0].read_bytes() == intervals[1].read_bytes()
-    assert not list(killed.rglob("*.partial"))

@@ -6,7 +6,6 @@ from commands.reconstruct import simulated
 from commands.reconstruct.test_command import one_line, record_of, runner
 from commands.study import tiny
 
-import thincam_jax as tc
 from helpers import ROOT, relative_l2
 from thincam_jax.commands import cli
 from thincam_jax.commands.reconstruct.options import read_camera
@@ -62,27 +61,6 @@ def test_what_does_not_go_together(files):
     typed = ("reconstruct", *given, "--camera", files["study"])
     result = runner.invoke(cli.app, [str(part) for part in (*typed, "--background", "corner")])
     assert "the PSF's corner says nothing about it" in one_line(result)
-
-
-@pytest.mark.thorough
-@pytest.mark.filterwarnings("default")
-def test_it_needs_no_background(files):
-    """Found with the image, within 1 dB; told, as it is not always so; the advice takes it away."""
-    out, images = files["study"].with_name("image.npy"), {}
-    for known in ((), ("--background", "found"), ("--background", simulated.DARK)):
-        typed = ("reconstruct", "--capture", files["capture"], "--out", out, "--bits", 12)
-        typed += ("--camera", files["study"], "--set", "object.distance=40mm", *known)
-        result = runner.invoke(cli.app, [str(part) for part in typed])
-        assert result.exit_code == 0, result.output
-        images[known[1:]] = np.load(out)
-        is_told = "whose black may turn grey" in result.stderr
-        assert is_told == (known[-1:] != (simulated.DARK,))
-        log = record_of(out)["preparation"]
-        assert log["psf"]["background"] == "number"
-    assert log["capture"]["background"] == "number"
-    found, again, best = images.values()
-    np.testing.assert_array_equal(found, again)
-    assert relative_l2(found, best) < 0.1
 
 
 @pytest.mark.thorough

@@ -198,18 +198,6 @@ def test_mosaic(tmp_path):
     assert record_of(out)["preparation"]["options"]["bayer"] == "RGGB"
 
 
-@pytest.mark.thorough
-def test_noise_of_a_mosaic(tmp_path):
-    """Interpolated neighbours share their noise: it is that of each colour's own pixels."""
-    paths = simulated.bayer_files(tmp_path)
-    counts = 40 + np.random.default_rng(7).normal(400, 50, (120, 152)).clip(0, 3000)
-    tifffile.imwrite(paths["capture"], counts.round().astype(np.uint16))
-    out = tmp_path / "image.npy"
-    more = ("--bits", 12, "--bayer", "RGGB", "--background", 0, "--iterations", 1)
-    assert call(paths, out, *more).exit_code == 0
-    assert record_of(out)["reconstruction"]["noise"]["counts"] == pytest.approx(50, rel=0.1)
-
-
 class TestFolder:
     NAMES = ("a", "b", "c")
 
@@ -377,18 +365,6 @@ def test_hand_is_explained_as_well_as_before(tmp_path):
 def check(paths, *more, psf="psf"):
     given = ["--psf", paths[psf], "--capture", paths["capture"], "--background", paths["dark"]]
     return runner.invoke(cli.app, ["calibrate", "check", *map(str, given), *map(str, more)])
-
-
-@pytest.mark.thorough
-def test_check_names_a_turned_psf(grey, tmp_path):
-    right = check(grey)
-    assert right.exit_code == 0, right.output
-    assert "your PSF fits best as it is" in right.stdout
-    grey["turned"] = tmp_path / "turned.tif"
-    tifffile.imwrite(grey["turned"], tifffile.imread(grey["psf"])[::-1, ::-1])
-    wrong = check(grey, psf="turned")
-    assert wrong.exit_code == 1
-    assert "your PSF is wrong: it fits better turned by 180°" in wrong.stdout
 
 
 @pytest.mark.thorough

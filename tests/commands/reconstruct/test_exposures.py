@@ -229,23 +229,3 @@ class TestFolderOfBackgrounds:
         log = record_of(tmp_path / "each" / "1.npy")["preparation"]
         assert log["capture"]["background"] == f"dark frame {backgrounds / '1.tif'}"
         assert log["psf"]["background"] == "corner"
-
-
-@pytest.mark.thorough
-@pytest.mark.filterwarnings("default")
-def test_no_bit_depth_needs_a_background(files, tmp_path):
-    """A PSF in 8 bit: its own level is found, and that of the capture with the image."""
-    eight = tifffile.imread(files["psf"]) // 16
-    tifffile.imwrite(tmp_path / "eight.tif", eight.astype(np.uint8))
-    out, best = tmp_path / "a.npy", tmp_path / "best.npy"
-    given = ("--psf", tmp_path / "eight.tif", "--psf-bits", 8, "--capture", files["capture"])
-    known = ("--background", simulated.DARK, "--psf-background", simulated.DARK / 16)
-    assert call(best, *given, *known).exit_code == 0
-    for more in ((), ("--background", "found")):
-        result = call(out, *given, *more)
-        assert result.exit_code == 0, result.output
-        assert score(out) > score(best) - 1
-        log = record_of(out)["preparation"]
-        assert log["capture"]["background"] == "found with the image"
-    line = one_line(call(out, *given, "--background", "corner"))
-    assert "the PSF's corner says nothing about it" in line and line.endswith("give 'found'")

@@ -2,14 +2,11 @@
 
 import json
 import re
-from dataclasses import asdict
 
-import numpy as np
 import pytest
 from commands.pages import assert_says_its_result
 from commands.refocus import tiny
 from commands.study.tiny import Told
-from studies import tiny_refocus
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.refocus import build_refocus, run_refocus
@@ -27,17 +24,6 @@ def run(tmp_path_factory):
         found["found_mm"] for found in metrics["objects"].values()
     ]
     return study, folder.path, metrics, texts
-
-
-@pytest.mark.thorough
-def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
-    result, metrics = tiny_refocus.study().run(), run[2]
-    assert metrics["objects"] == {name: asdict(one) for name, one in result.objects.items()}
-    assert metrics["methods"] == {name: asdict(one) for name, one in result.methods.items()}
-    sweep = metrics["sweep"]
-    assert sweep["distances_mm"] == np.round(np.asarray(result.sweep.distances), 4).tolist()
-    for name, curve in sweep["curves"].items():
-        np.testing.assert_allclose(curve, result.found.curve(name), rtol=1e-5)
 
 
 def test_report_stands_alone_and_is_escaped(run):

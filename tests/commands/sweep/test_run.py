@@ -9,12 +9,10 @@ import sys
 import time
 from pathlib import Path
 
-import jax
 import psutil
 import pyarrow.parquet as pq
 import pytest
 from commands.sweep import mini
-from commands.test_cli import call
 
 from helpers import ROOT
 from thincam_jax.commands.sweep import run
@@ -144,79 +142,6 @@ def environment(file: Path) -> dict[str, str]:
         "TF_CPP_MIN_LOG_LEVEL": "3",
     }
     return {**kept, **cache, "PYTHONPATH": path}
-
-
-def finish(file: Path, out: Path, *grid: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        command(file, out, *grid),
-        capture_output=True,
-        text=True,
-        env=environment(file),
-        timeout=300,
-    )
-
-
-def kill_half_way(file: Path, out: Path, grid: str, half: int) -> None:
-    """SIGKILL for the command once half of the points have ended; its workers end by themselves."""
-    process = subprocess.Popen(
-        command(file, out, grid),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=environment(file),
-    )
-    try:
-        while len(list(out.glob("points/*.parquet"))) < half:
-            assert process.poll() is None, "it ended before half of its points"
-            time.sleep(0.01)
-        parent = psutil.Process(process.pid)
-        workers = parent.children(recursive=True)
-        assert workers
-        # A port would let any user of this machine run code as this one.
-        assert not [c for p in (parent, *workers) for c in p.net_connections("inet")]
-    finally:
-        process.kill()
-        process.wait()
-    _, alive = psutil.wait_procs(workers, timeout=60)
-    assert not alive
-
-
-def check(path: Path, wanted: list[int]) -> None:
-    assert [row["seed"] for row in rows(path)] == wanted
-    assert len({row["point"] for row in rows(path)}) == len(wanted)
-    psnr = [row["psnr_db/single/star"] for row in rows(path)]
-    assert len(set(psnr)) > len(wanted) / 2  # noise of their own
-    assert all(5 < value < 30 for value in psnr)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("count", [24, 200])
-def test_sweep_that_is_killed_half_way(tmp_path, count):
-    """It goes on with what is missing; with one point that always fails it has one row less."""
-    file, out = mini.write(tmp_path), tmp_path / "out"
-    kill_half_way(file, out, f"seed=0:{count - 1}:{count}", count // 2)
-    written = {part: part.stat().st_mtime_ns for part in out.glob("points/*.parquet")}
-    assert count // 2 <= len(written) < count
-    assert not (out / "results.parquet").exists()
-    done = finish(file, out, f"seed=0:{count - 1}:{count}")
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert f"{count} of {count} points: {out / 'results.parquet'}" in done.stdout
-    check(out, list(range(count)))
-    assert {part: part.stat().st_mtime_ns for part in written} == written
-    assert not (out / "failures.jsonl").exists()
-
-    with jax.enable_x64(False):  # the precision of a user
-        done = call("sweep", file, "--out", out, "--grid", f"seed=-1:{count - 2}:{count}")
-    assert done.exit_code == 0
-    check(out, list(range(count - 1)))
-    reason = (
-        f"--grid seed=-1:{count - 2}:{count}: seed: -1: input should be greater than or equal to 0"
-    )
-    assert failures(out) == {(-1,): reason}
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(
-        f"thincam: 1 of {count} points failed; the first (seed=-1): {reason}; all"
-    )
 
 
 @pytest.mark.thorough

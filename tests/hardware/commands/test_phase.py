@@ -1,12 +1,9 @@
 """A phase-only light modulator by the commands, on the virtual rig."""
 
-import json
-
 import numpy as np
 import PIL.Image
 import pytest
 import yaml
-from commands.pages import assert_says_its_result
 from commands.test_cli import call, one_line
 from hardware.commands import tiny
 
@@ -31,24 +28,6 @@ def file(tmp_path_factory):
 
 def loaded(file, *overrides):
     return load_as(CaptureConfig, file, overrides)
-
-
-@pytest.mark.thorough
-def test_frames_are_those_of_the_phases_shown(file):
-    """A panel of other phases than its table gives other frames, by far more than the noise."""
-    found = {}
-    for name, sets in (("same", ()), ("other", ("--set", f"virtual.phase_levels={OTHER}"))):
-        store, out = file.with_name(f"{name}.zarr"), file.with_name(name)
-        for args in (("capture", file, "--out", store, *sets), ("run", store, "--out", out)):
-            result = call(*args)
-            assert result.exit_code == 0, result.output
-        metrics = json.loads((out / "metrics.json").read_text("utf-8"))
-        (found[name],) = metrics["agreement"]["frame_residual_over_noise"]
-        assert "Plan scene" in assert_says_its_result(out)
-    assert abs(found["same"] - 1) < 0.04 and found["other"] > 1.2
-
-
-OTHER = "{phases: [0 rad, 6.26 rad], wavelength: 532 nm}"
 
 
 def test_phases_of_files(file, tmp_path):

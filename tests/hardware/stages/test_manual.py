@@ -3,14 +3,10 @@
 import io
 import itertools
 import signal
-import subprocess
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from hardware.acquisition.fault_campaign import require_right
-from hardware.acquisition.test_faults import ENVIRONMENT, PROCESS, frames_in
+from hardware.acquisition.test_faults import frames_in
 from hardware.memory_rig import World, fiducial_plan
 
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
@@ -155,39 +151,6 @@ def test_a_resumed_run_offers_what_was_read(monkeypatch, tmp_path):
     assert person.asked[0].startswith(f"Move the stage to 1 mm, where it read {reading(1):g} mm, ")
     assert "read" not in person.asked[1].partition(";")[0]
     require_unbroken(monkeypatch, tmp_path, store)
-
-
-@pytest.mark.parametrize(
-    ("kills", "count"), [(1, 20), pytest.param(20, 240, marks=pytest.mark.thorough)]
-)
-def test_a_killed_run_is_resumed(monkeypatch, kills, count, tmp_path):
-    """By SIGKILL at a random moment, in front of a question or within frames."""
-    store, random = tmp_path / "store", np.random.default_rng(5)
-    for _ in range(kills):
-        process = subprocess.Popen(
-            [*PROCESS, store, str(count), "manual"], env=ENVIRONMENT, text=True, bufsize=1,
-            stdin=subprocess.PIPE, stderr=subprocess.PIPE
-        )  # fmt: skip
-        with process:
-            assert process.stdin and process.stderr
-            for _ in range(int(random.integers(1, 3))):
-                question = ""
-                while not question.endswith("): "):
-                    letter = process.stderr.read(1)
-                    assert letter, question
-                    question += letter
-                process.stdin.write(f"{read_at(question)}\n")
-            time.sleep(random.uniform(0.0, 0.03))
-            assert process.poll() is None
-            process.send_signal(signal.SIGKILL)
-    Person(monkeypatch)
-    plan = fiducial_plan(count, dark_every=16)
-    with World().rig(manual=True) as rig:
-        assert acquire(plan, rig, store).complete
-    require_right(store, plan)
-    places = [shot["position"] for shot in Acquisition.load(store).shots]
-    assert places == [reading(step.position) for step in plan.steps]
-    assert not list(Path(tmp_path).rglob("*.partial"))
 
 
 def test_a_preview_leaves_it_to_its_person(monkeypatch):

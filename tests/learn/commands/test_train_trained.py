@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from learn.commands.test_train import call, line
 from learn.test_trained import drawn_psf
-from learn.test_trained_training import pictures
 from typer.testing import CliRunner
 
 from thincam_jax.commands import cli
-from thincam_jax.learn.trained import TrainedReconstruction, training_record
-from thincam_jax.learn.trained_lessons import CameraLessons
-from thincam_jax.learn.trained_training import NETWORK, STATE
+from thincam_jax.learn.trained import TrainedReconstruction
 
 FILE = """
 name: tiny
@@ -44,42 +41,6 @@ def trained_file(folder, psf=PSF):
 
 def run(*arguments):
     return CliRunner().invoke(cli.app, [str(a) for a in arguments])
-
-
-@pytest.mark.thorough
-def test_a_training_is_told_and_gone_on_with(file, tmp_path):
-    out = tmp_path / "out"
-    done = call(file, "--out", out)
-    assert done.exit_code == 0, done.output
-    assert "finished: " in done.stdout and "to its physics step" in done.stdout
-    result = json.loads((out / "training.json").read_text("utf-8"))
-    assert result["steps"] == 4 and len(result["scores"]) == 2
-    assert len(result["psnr_db"]["trained"]) == 1
-    record = training_record(out / NETWORK)
-    assert record["images"]["trained on"][0]["licence"] == "drawn"
-    assert record["faults"]["scale"] == 0.02 and record["sensor"] == [24, 32]
-    assert "give --resume to go on with it" in line(call(file, "--out", out))
-    assert call(file, "--out", out, "--resume").exit_code == 0
-    state = out / STATE
-    state.write_bytes(state.read_bytes()[:-1])
-    assert "is damaged or cut off" in line(call(file, "--out", out, "--resume"))
-    # Its numbers are the start of a training on pairs, of the same size.
-    for folder in ("captures", "truths"):
-        (tmp_path / "pairs" / folder).mkdir(parents=True)
-    for number in range(3):
-        recording, scene = CameraLessons(PSF, (24, 32), pictures()).drawn(0, number)
-        light = np.asarray(recording.captures[0])[0].astype(np.float32)
-        np.save(tmp_path / "pairs/captures" / f"{number}.npy", light)
-        np.save(tmp_path / "pairs/truths" / f"{number}.npy", scene[0, 11:35, 15:47])
-    more = "--set", "pairs={path: pairs, judged: 1}", "--set", f"start={out / NETWORK}"
-    tuned = call(file, "--out", tmp_path / "b", *more)
-    assert tuned.exit_code == 0, tuned.output
-    # It carries the pictures of its start, and their licences.
-    uses = training_record(tmp_path / "b" / NETWORK)["images"]
-    assert uses["trained on, before"] == record["images"]["trained on"]
-    assert [entry["name"] for entry in uses["trained on"]] == ["0", "1"]
-    other = line(call(file, "--out", tmp_path / "c", *more, "--set", "network.widths=[6]"))
-    assert "give these in the section network" in other
 
 
 def test_what_cannot_be_used_is_told(file, tmp_path):

@@ -8,21 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tifffile
-from commands.pages import assert_says_its_result
 from commands.study.tiny import Told
 from PIL import Image
 from waveguide.commands import tiny
-from waveguide.studies import tiny_screen
 
 from helpers import ROOT
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.run_folder import RunFolder, to_json
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.waveguide.commands.run import build_cameras, build_screen, run_screen
 from thincam_jax.waveguide.field_of_view import field_of_view
 from thincam_jax.waveguide.rays import RayStatus
-from thincam_jax.waveguide.studies.calibration import MEASURED, calibrate
 
 
 def stored(path):
@@ -64,13 +61,13 @@ LIT = (
 
 
 def test_the_light_of_a_display_in_a_file(tmp_path):
-    study = build_screen(tiny.experiment(tmp_path, *LIT, "display_frames=3"))
-    assert study.display_light is not None and study.display_frames == 3
-    np.testing.assert_allclose(study.display_light.leak, [[400e-6, 0.1], [700e-6, 0.1]])
     pattern = np.ones((22, 30), np.float32)
     pattern[:11] = 3
     tifffile.imwrite(tmp_path / "light.tif", pattern)
-    lit = build_screen(tiny.experiment(tmp_path, *LIT, "display_light.path=light.tif"))
+    more = ("display_frames=3", "display_light.path=light.tif")
+    lit = build_screen(tiny.experiment(tmp_path, *LIT, *more))
+    assert lit.display_light is not None and lit.display_frames == 3
+    np.testing.assert_allclose(lit.display_light.leak, [[400e-6, 0.1], [700e-6, 0.1]])
     np.testing.assert_allclose(
         np.asarray(lit.background)[[0, -1], 0] / lit.background.mean(), [1.5, 0.5], 1e-5
     )
@@ -98,22 +95,6 @@ def test_a_page_says_the_light_of_a_display(tmp_path):
 def test_a_display_that_does_not_fit_is_told(asked, line, tmp_path):
     with pytest.raises(ConfigError, match=line):
         build_screen(tiny.experiment(tmp_path, *LIT, asked))
-
-
-@pytest.mark.thorough
-def test_the_file_gives_the_numbers_of_the_same_study_in_python(run):
-    study, metrics = tiny_screen.study(), run[2]
-    result, calibrated = study.run(), calibrate(study, tiny_screen.CALIBRATION)
-    models = {name: model.methods for name, model in result.models.items()}
-    for name, methods in (models | {MEASURED: calibrated.methods}).items():
-        for method, found in methods.items():
-            told = metrics["models"][name]["methods"][method]
-            assert told["mean_psnr_db"] == found.scores.mean_psnr_db
-            assert told["targets"] == asdict(found.scores)["targets"]
-    told, found = metrics["calibration"], json.loads(to_json(asdict(calibrated.scores)))
-    for timed in (told, told["fit"], found, found["fit"]):
-        del timed["seconds"]
-    assert told == found
 
 
 @pytest.mark.thorough
@@ -174,16 +155,6 @@ def test_progress_and_files(run):
     assert len(list((path / "images").iterdir())) == 2 * 2
     assert not list(path.glob("*.zarr"))  # keep_captures
     assert tiny.experiment(path, text=(path / "config.yaml").read_text("utf-8")) == study.config
-
-
-@pytest.mark.thorough
-def test_report_stands_alone_and_is_escaped(run):
-    page = assert_says_its_result(run[1])
-    sources = re.findall(r'src="([^"]+)"', page)
-    assert len(sources) == len(PICTURES)
-    assert all(source.startswith("data:image/") for source in sources)
-    assert "&lt;b&gt;of its own&lt;/b&gt;" in page
-    assert ">16.8</td>" in page  # published
 
 
 @pytest.mark.parametrize(
