@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import value_and_slope
 from thincam_jax.design.cell_masks import (
     LEVELS,
     CellMasks,
@@ -50,7 +51,7 @@ def test_psf_has_the_transfer_function_of_overlaps():
     """With finer samples less of the light beyond their band is missed."""
     cells, u = drawn(), np.array([1.3, 5.0, 9.7])
     wanted, errors = np.array([transfer(cells * 1.0, f) for f in u]), []
-    for pitch in (0.02, 0.005, 0.00125):
+    for pitch in (0.02, 0.005, 0.0025):
         optics = CellOptics(space(), FAR, pitch)
         psf, step = np.asarray(optics(jnp.asarray(cells * 1.0))), float(optics.grid.pitch)
         waves = np.exp(-2j * np.pi * u * np.asarray(optics.grid.x)[:, None])
@@ -58,7 +59,7 @@ def test_psf_has_the_transfer_function_of_overlaps():
         errors.append(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
     assert errors[0] < 0.1
     assert errors[1] < 0.02
-    assert errors[2] < 0.004
+    assert errors[2] < 0.005
 
 
 @pytest.mark.parametrize("levels", LEVELS)
@@ -182,11 +183,12 @@ def test_slope_and_batches():
         return jnp.sum(weight * optics(free.amplitudes(free.parts(x))[0]))
 
     way = jnp.asarray(rng.normal(size=numbers.shape))
-    exact = float(jnp.sum(jax.grad(cost)(numbers) * way))
-    step = (cost(numbers + 1e-5 * way) - cost(numbers - 1e-5 * way)) / 2e-5
+    value, slope = value_and_slope(cost)
+    exact, numbers, way = float(np.sum(slope(numbers) * way)), np.asarray(numbers), np.asarray(way)
+    step = (value(numbers + 1e-5 * way) - value(numbers - 1e-5 * way)) / 2e-5
     assert exact == pytest.approx(float(step), rel=1e-6)
-    several = jax.vmap(cost)(jnp.stack([numbers, 2 * numbers]))
-    assert several[1] == pytest.approx(float(cost(2 * numbers)), rel=1e-12)
+    several = jax.jit(jax.vmap(cost))(np.stack([numbers, 2 * numbers]))
+    assert several[1] == pytest.approx(float(value(2 * numbers)), rel=1e-12)
 
 
 def test_drawn_masks_fit():

@@ -117,7 +117,7 @@ def test_other_masks_are_refused(mask, error, message, tmp_path):
         tc.design.write_gds(tmp_path / "mask.png", MASKS["disc"])
 
 
-@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("double", quick([False, True], 0))
 def test_a_grey_plate_is_written_in_cells(double, tmp_path):
     """As the refusal advises; every cell is read back, and is as wide as the shop's finest."""
     with jax.enable_x64(double):

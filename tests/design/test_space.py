@@ -4,6 +4,7 @@ import logging
 import math
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +55,7 @@ def test_the_point_of_a_design():
     other = Variable("beta", 9.0, 60.0, (2, 3))
     space = DesignSpace(BASE, (BETA, other, LENGTH, WIDE), Limits(mask_pixel=0.02))
     points = jnp.asarray(np.random.default_rng(2).uniform(size=(20, 4)))
-    again = jax.vmap(lambda p: space.point(space.design(p)))(points)
+    again = jax.jit(jax.vmap(lambda p: space.point(space.design(p))))(points)
     np.testing.assert_allclose(again, points, atol=1e-12)
     tight = DesignSpace(BASE, (BETA, Variable("distance", 6.5, 6.5, (0, 1, 2, 3))))
     np.testing.assert_allclose(tight.point(BASE), [17 / 28, 0.5])
@@ -76,11 +77,12 @@ def test_captures_share_an_exposure():
     )
     free = Variable("exposure", 0.5, 2.5, (0, 1))
     space = DesignSpace(base, (BETA, free), Limits(exposure=6.0))
+    there, back = eqx.filter_jit(space.design), eqx.filter_jit(space.point)
     for place, shares in ((0.0, [0.5, 0.5, 1.25, 3.75]), (1.0, [2.5, 2.5, 0.25, 0.75])):
-        design = space.design(jnp.asarray([0.3, place]))
+        design = there(jnp.asarray([0.3, place]))
         np.testing.assert_allclose(design.exposure, shares)
-        np.testing.assert_allclose(space.point(design), [0.3, place], atol=1e-12)
-    slope = jax.jacfwd(lambda p: space.design(p).exposure)(jnp.asarray([0.3, 0.5]))
+        np.testing.assert_allclose(back(design), [0.3, place], atol=1e-12)
+    slope = jax.jit(jax.jacfwd(lambda p: space.design(p).exposure))(jnp.asarray([0.3, 0.5]))
     np.testing.assert_allclose(slope[:, 1], [2, 2, -1, -3])
     kept = DesignSpace(base, (BETA,), Limits(exposure=3.0)).design(jnp.asarray([0.3]))
     np.testing.assert_allclose(kept.exposure, [0.5, 0.5, 0.5, 1.5])

@@ -159,13 +159,12 @@ def test_gradients_are_those_of_finite_differences(what):
     weights = jnp.asarray(np.random.default_rng(1).normal(size=SENSOR.shape))
 
     def seen(change):
-        own = [[plate(p) for p in row] for row in PHASES]
-        heights = jnp.zeros((2, 2))
+        heights, beta, phase = jnp.zeros((1, 2)), 50.0, 0.3
         if what == "spacer":
-            heights = heights.at[1, 0].set(0.2 + change)
+            heights = heights.at[0, 1].set(0.2 + change)
         else:
             beta, phase = (50 + change, 0.3) if what == "beta" else (50.0, 0.3 + change)
-            own[1][0] = plate(phase, beta)
+        own = [[plate(), plate(phase, beta)]]
         one = tc.Mosaic(own, SENSOR, DISTANCE, wall=0.1, spacers=heights)
         psfs = [tc.psf(c, wavelength=LIGHT, object_distance=NEAR) for c in one.cameras]
         return jnp.sum(weights * one.join(psfs))

@@ -21,6 +21,7 @@ def exposures(layout=FOUR, **others):
     return tc.Exposures(50.0, 3.0, **LIGHT, **others).fringe_scanned().at_once(layout)
 
 
+@pytest.mark.thorough
 def test_captures_are_parts_of_a_frame():
     method = Method("mosaic", exposures(), tc.Wiener(), "fringe_scanning")
     study = tiny.study(methods=(method,), noise=None)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,10 +15,12 @@ from thincam_jax import waveguide as wg
 from thincam_jax.imaging.encoding import cie_1931
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import nm
-from thincam_jax.waveguide.display import DisplayLight, display_alone, tint, transmission
+from thincam_jax.waveguide import display
+from thincam_jax.waveguide.display import DisplayLight, display_alone, tint
 from thincam_jax.waveguide.studies.screen import ScreenModel
 
 AXIS = jnp.zeros(2)
+transmission = eqx.filter_jit(display.transmission)
 LCD = [
     wg.ColourBand(centre * nm, width * nm) for centre, width in ((450, 20), (530, 35), (625, 20))
 ]

@@ -11,7 +11,7 @@ from waveguide.setting import camera, hologram
 from waveguide.test_rays import snell, to_plane, turned
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.units import nm, um
@@ -163,7 +163,8 @@ def test_direct_light_is_refracted_at_two_planes(tilt):
         assert found[0, 0] == pytest.approx(left)
 
 
-def test_direct_light_is_added_to_the_capture():
+@pytest.mark.parametrize("planned", quick([False, True], 0))
+def test_direct_light_is_added_to_the_capture(planned):
     plane = wg.ObjectPlane((24, 28), distance=550.0, width=150.0, centre=(0.0, 0.0))
     sensor = tc.Sensor((20, 14), 120 * um)
     dark = dataclasses.replace(camera(), sensor=sensor)
@@ -176,7 +177,8 @@ def test_direct_light_is_added_to_the_capture():
     added = np.asarray(with_light(image) - without(image)).ravel()
     np.testing.assert_allclose(added, alone, rtol=1e-9)
     assert alone.max() > 10  # some 200 nm for some 5
-    plan = wg.plan_screen(lit, LitPlane(plane, image), tolerance=0.02)
-    planned = plan.system()(image.astype(jnp.dtype(plan.precision)))
-    every = planes_operator(lit, plane, (12, 8), plan.level)(image)
-    assert relative_l2(np.asarray(planned, float), np.asarray(every)) <= plan.predicted_error
+    if planned:
+        plan = wg.plan_screen(lit, LitPlane(plane, image), tolerance=0.02)
+        found = plan.system()(image.astype(jnp.dtype(plan.precision)))
+        every = planes_operator(lit, plane, (12, 8), plan.level)(image)
+        assert relative_l2(np.asarray(found, float), np.asarray(every)) <= plan.predicted_error

@@ -104,7 +104,7 @@ def frames_in(store):
 @pytest.mark.parametrize(
     ("kills", "count", "kept"),
     [
-        (2, 40, ""),
+        (1, 40, ""),
         pytest.param(20, 500, "", marks=pytest.mark.thorough),
         pytest.param(10, 512, "rows", marks=pytest.mark.thorough),
         pytest.param(6, 240, "pictures", marks=pytest.mark.thorough),

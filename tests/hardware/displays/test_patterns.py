@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import quick
 from thincam_jax.hardware.acquisition.plan import BLACK, Pattern
 from thincam_jax.hardware.displays.patterns import mask_pattern, on_cells, pattern_levels
 from thincam_jax.hardware.plans import zone_plate
@@ -26,14 +27,7 @@ def zones(profile, phase=0.4, pixels=(16, 32)):
     )
 
 
-@pytest.mark.parametrize(
-    "profile",
-    [
-        "cosine",
-        pytest.param("intensity", marks=pytest.mark.thorough),
-        pytest.param("binary", marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.parametrize("profile", quick(["cosine", "intensity", "binary"], 0))
 def test_zones_are_those_of_the_formula(profile):
     y, x = (PITCH * (np.arange(count) - (count - 1) / 2) for count in SHAPE)
     wave = np.cos(12.0 * (y[:, None] ** 2 + x**2) + 0.4)

@@ -92,7 +92,8 @@ def test_bad_input():
     with pytest.raises(ValueError, match=r"matrix has shape \(12,\); give rows and columns"):
         Sparse(scipy.sparse.coo_array(np.ones(12)), IN, OUT)
     with pytest.raises(ValueError, match="1 batch and 0 dense axes; give two axes, both sparse"):
-        Sparse(sparse.BCOO.fromdense(jnp.ones((10, 12)), n_batch=1), IN, OUT)
+        rows = np.ones((10, 12)), np.broadcast_to(np.arange(12)[:, None], (10, 12, 1))
+        Sparse(sparse.BCOO(tuple(map(jnp.asarray, rows)), shape=(10, 12)), IN, OUT)
     with pytest.raises(ValueError, match=r"in_shape = \(3, 5\), but the matrix has 12 columns"):
         Sparse(H, (3, 5), OUT)
     with pytest.raises(ValueError, match=r"out_shape = \(5, 3\), but the matrix has 10 rows"):

@@ -1,5 +1,6 @@
 """`thincam train` of a reconstruction, and its file as a method of the commands."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ from learn.test_trained import drawn_psf
 from typer.testing import CliRunner
 
 from thincam_jax.commands import cli
+from thincam_jax.commands.evaluate import run as evaluation
 from thincam_jax.learn.trained import TrainedReconstruction
 
 FILE = """
@@ -58,7 +60,13 @@ def test_what_cannot_be_used_is_told(file, tmp_path):
     assert "give the fewest first" in told("faults.electrons=[9, 3]")
 
 
-def test_its_file_is_a_method_of_the_commands(tmp_path):
+def in_turn(function, arguments):
+    """Tasks, done in this process."""
+    for name, given in arguments.items():
+        yield name, function(*given)
+
+
+def test_its_file_is_a_method_of_the_commands(tmp_path, monkeypatch):
     np.save(tmp_path / "psf.npy", PSF[0])
     path, data = trained_file(tmp_path), tmp_path / "data"
     for folder in ("captures", "truths"):
@@ -77,6 +85,7 @@ def test_its_file_is_a_method_of_the_commands(tmp_path):
     assert told == "a trained reconstruction has no tau; leave it out"
     told = line(run("reconstruct", *files, *capture, "--method", tmp_path / "no.thincam"))
     assert "no.thincam: is missing; give a file that 'thincam train' wrote" in told
+    monkeypatch.setattr(evaluation, "workers_of", lambda *_: contextlib.nullcontext(in_turn))
     compared = run("evaluate", data, *files, "--method", path, "--method", "ridge", "--out",
                    tmp_path / "scores", "--workers", "1")  # fmt: skip
     assert compared.exit_code == 0, compared.output

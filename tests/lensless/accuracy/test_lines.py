@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax._core.grids import Grid, SparseGrid
 from thincam_jax.lensless.accuracy.probe import (
     COUNT,
@@ -81,7 +81,7 @@ def test_a_seed_is_a_choice():
     assert (first != other).any()
 
 
-@pytest.mark.parametrize("factor", [1, 3, 5])
+@pytest.mark.parametrize("factor", quick([1, 3, 5], 1))
 def test_points_are_those_of_the_grid(factor):
     """Coordinates, and the samples that a pixel is divided into: those of the finer grid."""
     grid = Grid((40, 9), jnp.asarray(0.02))

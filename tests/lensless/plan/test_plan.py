@@ -197,7 +197,7 @@ def test_a_plan_notices_other_light_and_larger_planes():
 
 
 def test_a_batch_is_planned_as_one():
-    colours = scene(4, 3, batch=(3,))
+    colours = scene(3, 2, batch=(3,))
     plan = tc.plan_capture(camera(), colours, tolerance=1e-2, over_field=False)
     planned = tc.capture(camera(), colours, model=plan)
     assert relative_l2(planned, tc.capture(camera(), colours)) <= plan.predicted_error
