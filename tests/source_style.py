@@ -163,6 +163,7 @@ _PRODUCTS = {
     *(f"jnp.{name}" for name in ("dot", "einsum", "inner", "matmul", "tensordot", "vdot")),
     *(f"jax.lax.{name}" for name in ("conv_general_dilated", "dot", "dot_general")),
 }
+_NAMES = {name.rpartition(".")[2] for name in _PRODUCTS}
 
 
 def rounded_products(modules: list[Module]) -> list[str]:
@@ -170,8 +171,9 @@ def rounded_products(modules: list[Module]) -> list[str]:
     return [
         f"{module.path}:{node.lineno}: {ast.unparse(node.func)}: give precision='highest'"
         for module in modules
-        for node in ast.walk(module.tree)
+        for node in module.nodes
         if isinstance(node, ast.Call)
+        and getattr(node.func, "attr", "") in _NAMES
         and ast.unparse(node.func) in _PRODUCTS
         and "precision" not in {keyword.arg for keyword in node.keywords}
     ]

@@ -3,7 +3,7 @@
 import ast
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 PACKAGE = "thincam_jax"
@@ -113,6 +113,7 @@ class Module:
                     yield node.lineno, ".".join([*base, alias.name])
 
 
+@cache
 def read_package(folder: Path) -> list[Module]:
     modules = []
     for path in sorted(folder.rglob("*.py*")):

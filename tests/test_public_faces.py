@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import importlib
 import inspect
 import operator
@@ -108,14 +109,19 @@ def assigned(name: str) -> ast.expr:
     return value
 
 
+@functools.cache
+def listed() -> set[str]:
+    """The packages and modules of the reference."""
+    packages = assigned("PACKAGES")
+    assert isinstance(packages, ast.Tuple)
+    names = {one.value for one in packages.elts if isinstance(one, ast.Constant)}
+    names |= {f"thincam_jax.{one}" for one in ast.literal_eval(assigned("MODULES"))}
+    return names | {"thincam_jax", "thincam_jax.units"}
+
+
 def public(module: str, name: str) -> bool:
     """Whether the reference lists a module, or a sub-package that is imported by its name."""
-    listed = assigned("PACKAGES")
-    assert isinstance(listed, ast.Tuple)
-    packages = {"thincam_jax", "thincam_jax.units"}
-    packages |= {one.value for one in listed.elts if isinstance(one, ast.Constant)}
-    packages |= {f"thincam_jax.{one}" for one in ast.literal_eval(assigned("MODULES"))}
-    return module in packages or f"{module}.{name}" in packages
+    return module in listed() or f"{module}.{name}" in listed()
 
 
 def test_the_reference_names_what_packages_export():

@@ -160,6 +160,7 @@ def test_a_lens_attains_the_limit_of_phase_masks():
     assert 0 <= found.above(np.sum(left)) < 0.05
 
 
+@pytest.mark.thorough
 def test_zone_plates_keep_to_the_limit_of_amplitudes():
     """Which one that focuses on the sensor, a lens, nears, and passes that of shadows."""
     searched = problem(LIGHTS[2])

@@ -62,6 +62,7 @@ def model():
     return changed(TrainedReconstruction.create(OPTIONS, PSF, key=0))
 
 
+@pytest.mark.thorough
 def test_untrained_it_gives_the_image_of_its_physics_step():
     recording, scene = recorded()
     untrained = TrainedReconstruction.create(OPTIONS, PSF, key=0)

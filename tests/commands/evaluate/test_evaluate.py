@@ -86,6 +86,7 @@ def rows_of(out):
 class TestSameImage:
     """As `thincam reconstruct` makes it of the same files."""
 
+    @pytest.mark.thorough
     def test_of_files(self, folder, tmp_path):
         dark = tmp_path / "dark.tif"
         simulated.write_tiff(dark, np.full(simulated.SHAPE, simulated.DARK))
