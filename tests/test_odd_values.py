@@ -1,6 +1,5 @@
 """Values that NumPy and Python have and JAX has not: converted, or one line that names them."""
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -94,51 +93,3 @@ def test_marks_of_a_name_are_written_out(tmp_path):
         with pytest.raises(CaptureFileError) as caught:
             measured.read_image(path)
         assert str(caught.value).isprintable() and "\\x1b[31m\\u202eb.png" in str(caught.value)
-
-
-def plain_and_whole():
-    """A camera into which `equinox.tree_at` put plain numbers, without converters, and one made."""
-    plain = eqx.tree_at(lambda c: (c.mask.beta, c.distance), CAMERA, (24.0, 7))
-    return plain, tc.LenslessCamera(zones(24.0), CAMERA.sensor, 7.0)
-
-
-def seen_by(camera):
-    return tc.Cameras([camera], wavelength=500 * nm, object_distance=250.0)
-
-
-def axial(camera):
-    return tc.psf(camera, wavelength=500 * nm, object_distance=250.0)
-
-
-def test_plain_numbers_put_into_a_module_are_converted_when_it_is_used():
-    plain, whole = plain_and_whole()
-    np.testing.assert_array_equal(axial(plain), axial(whole))
-    with pytest.raises(ValueError, match=r"distance = -7.0 mm is not positive; give distance > 0"):
-        axial(eqx.tree_at(lambda c: c.distance, CAMERA, -7))
-
-
-@pytest.mark.thorough
-def test_they_are_converted_everywhere():
-    """Off the axis, in captures, and cameras inside of a recording."""
-    plain, whole = plain_and_whole()
-    lit = tc.Scene(tc.ImagePlane(np.ones((12, 16)), 250.0, 40.0), 500 * nm)
-    for use in (
-        lambda one: tc.psf(one, wavelength=500 * nm, object_distance=250.0, at=(3.0, 5.0)),
-        lambda one: tc.capture(one, lit),
-    ):
-        np.testing.assert_array_equal(use(plain), use(whole))
-    captures = np.random.default_rng(0).random((1, 12, 16))
-    inside = tc.Recording(captures, seen_by(CAMERA))
-    inside = eqx.tree_at(lambda r: r.imaging_model.cameras[0], inside, plain)
-    solver = tc.AdmmTV(iterations=5)
-    images = [
-        tc.reconstruct(one, solver).image
-        for one in (
-            inside,
-            tc.Recording(captures, seen_by(plain)),
-            tc.Recording(captures, seen_by(whole)),
-        )
-    ]
-    assert float(images[2].max()) > 0
-    np.testing.assert_array_equal(images[0], images[2])
-    np.testing.assert_array_equal(images[1], images[2])

@@ -1,8 +1,6 @@
 """Free numbers of a design within their limits, and the design for an own sensor."""
 
-import logging
 import math
-import re
 
 import equinox as eqx
 import jax
@@ -12,12 +10,9 @@ import pytest
 from design.setting import thesis_design
 
 import thincam_jax as tc
-from thincam_jax._core import progress
 from thincam_jax.design import DesignSpace, Variable, shots
 from thincam_jax.design.design import Design
-from thincam_jax.design.landscape import evaluate_grid
 from thincam_jax.design.own_sensor import beta_bounds
-from thincam_jax.design.search import evaluate
 from thincam_jax.design.space import Limits, active_limits
 from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.units import um
@@ -149,37 +144,6 @@ def test_bounds_are_two_zones_and_two_pixels_a_period():
 def test_distances_that_cross_are_refused(given):
     with pytest.raises(ValueError, match=r"give the least and the most in mm, such as \(3, 10\)"):
         tc.design.for_sensor(tc.Sensor((12, 16), 100 * um), distance=given)
-
-
-@pytest.mark.thorough
-def test_no_worse_than_an_exhaustive_grid(monkeypatch, caplog):
-    """With the best so far on the line of progress while it goes on."""
-    monkeypatch.delenv("THINCAM_PROGRESS", raising=False)
-    monkeypatch.setattr(progress, "_SELDOM", 0.05)
-    with caplog.at_level(logging.INFO):
-        found = tc.design.for_sensor(tc.Sensor((60, 80), 40 * um), distance=(3.0, 6.0))
-    told = re.findall(r"error (\S+) dB so far, β of shot 1 \S+ rad/mm², .* mm$", caplog.text, re.M)
-    assert told and found.errors_db[0] <= min(map(float, told)) + 0.05
-    problem, best = found.problem, found.best
-    with jax.enable_x64(True):
-        points, costs = evaluate_grid(problem.objective, problem.space, problem.data, 17)
-        lowest = points[np.argsort(costs)[:8]]
-        numbers = problem.objective, problem.space, problem.exact
-        exact = np.asarray(evaluate(*numbers, lowest, at_a_time=1))
-        assert best.objective < 1.001 * exact.min()
-        for n, (low, high) in enumerate(found.plateaus):
-            assert low <= best.values[n] <= high
-            lower, upper = problem.space.lower[n], problem.space.upper[n]
-            ends = (jnp.array([low, high]) - lower) / (upper - lower)
-            inside = jnp.tile(best.point, (2, 1)).at[:, n].set(ends)
-            worse = 10 * np.log10(np.asarray(evaluate(*numbers, inside, at_a_time=1)))
-            assert np.all(worse - found.errors_db[0] <= 0.1 + 1e-6)
-    own, usual, random = found.errors_db
-    assert own <= min(usual, random)
-    assert found.evaluations < 1600
-    text = str(found)
-    assert "β of shot 1, rad/mm²" in text and "the thesis' pair" in text
-    assert text.count("is within 0.1 dB") == 3
 
 
 def test_active_limits_in_words():

@@ -257,13 +257,3 @@ def test_light_outside_of_the_materials_band_is_refused():
     here = camera(tc.PhaseMask(MAP, 5 * um, bk7()))
     with pytest.raises(ValueError, match=r"wavelength = 0.00025 mm is outside of the material's"):
         psf(here, wavelength=250 * nm)
-
-
-@pytest.mark.thorough
-def test_light_beside_the_sensor_does_not_come_back():
-    """A prism that bends past the sensor, beyond the window's band limit: nothing wraps round."""
-    ramp = np.tile(np.arange(60) * 0.45 * TURN, (40, 1))  # 90 cycles/mm, 0.45 mm at d = 10 mm
-    mask = tc.PhaseMask(ramp, 5 * um, INDEX, interpolation="bilinear")
-    flat = tc.PhaseMask(0 * ramp, 5 * um, INDEX)
-    dark, bright = (psf(camera(m, (20, 24), 5 * um), oversampling=1) for m in (mask, flat))
-    assert dark.sum() < 0.01 * bright.sum()

@@ -380,15 +380,6 @@ def test_single_precision(at):
     assert relative(np.asarray(single, float), exact) < 1e-4
 
 
-@pytest.mark.thorough
-def test_light_of_the_open_aperture_is_1():
-    """Far inside the shadow, at 20°, by each model."""
-    camera = tc.LenslessCamera(tc.Pinhole(3.0), tc.Sensor((5, 6), 20 * um), 2.0)
-    for model in ("geometric", "separable", tc.PsfMethod("angular_spectrum", oversampling=5)):
-        h = point_psf(camera, wavelength=500 * nm, at=(0.0, np.tan(20 * deg)), model=model)
-        np.testing.assert_allclose(np.mean(h), 1.0, atol=0.03)
-
-
 # --- what is refused ------------------------------------------------------------------------------
 
 

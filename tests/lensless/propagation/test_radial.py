@@ -120,17 +120,6 @@ def test_the_interpolated_profile(average):
 
 
 @pytest.mark.thorough
-def test_angular_spectrum_approaches_it():
-    """Where Fresnel's approximation holds, by more samples; before, that was the best model."""
-    camera = camera_of([1.0, 0.0, 0.6], 0.06, (40, 48), 10 * um, 20.0, (0.0, 0.0))
-    exact = psf(camera)
-    methods = [tc.PsfMethod("angular_spectrum", None, False, n, (150, 150)) for n in (1, 9)]
-    coarse, fine = (relative_l2(psf(camera, model=method), exact) for method in methods)
-    assert coarse > 3 * fine
-    assert fine < 4e-3
-
-
-@pytest.mark.thorough
 def test_choice_meets_the_tolerance():
     """`angular_spectrum`, the only model before, is 4 to 8 % off however many samples it has."""
     camera = camera_of(shape=(56, 45), pitch=5.5 * um)
