@@ -52,7 +52,7 @@ WITHOUT_HALF = pytest.mark.skipif(
 
 def marked(script):
     """Most take ten seconds and more, even small."""
-    marks = [] if script.stem == "own_sensor" else [pytest.mark.thorough]
+    marks = [] if script.stem == "limit_of_masks" else [pytest.mark.thorough]
     if "float16" in script.read_text("utf-8"):
         marks.append(WITHOUT_HALF)
     return pytest.param(script, id=script.stem, marks=marks)

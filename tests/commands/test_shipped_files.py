@@ -131,7 +131,7 @@ class TestExplain:
         assert rows["sensor.full_well: 13500.0"] == "default"
         assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
 
-    @but("design_slm", "design_distances", *STUDIES, *RIGS)
+    @but("design_slm", "design_distances", *STUDIES, *RIGS, "mosaic", "fza_superresolution")
     def test_every_file(self, path, tmp_path):
         result = call("explain", path, *options_of(path, tmp_path))
         assert result.exit_code == 0, result.output

@@ -245,7 +245,7 @@ SOLVERS = [
 ]
 
 
-@pytest.mark.parametrize("solver", quick(SOLVERS, 0, 1))
+@pytest.mark.parametrize("solver", quick(SOLVERS, 0))
 def test_no_solver_sees_a_uniform_background(solver):
     """Others for each capture, several times the light: the same image; 0, if 0 is known.
 
