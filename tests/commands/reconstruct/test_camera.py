@@ -6,6 +6,7 @@ from commands.reconstruct import simulated
 from commands.reconstruct.test_command import one_line, record_of, runner
 from commands.study import tiny
 
+import thincam_jax as tc
 from helpers import ROOT, relative_l2
 from thincam_jax.commands import cli
 from thincam_jax.commands.reconstruct.options import read_camera
