@@ -15,6 +15,7 @@ from PIL import Image
 
 import thincam_jax as tc
 from thincam_jax.imaging.targets import sample_image
+from thincam_jax.units import nm
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "three_lines"
@@ -46,3 +47,11 @@ result = tc.reconstruct(recording, "pnp")
 photograph, capture = scene.planes[0].image, recording.captures[0]
 figure = tc.plot.compare({"photograph": photograph, "capture": capture, "image": result})
 figure.savefig(FIGURES / "images.png", dpi=110)
+
+# %%
+# The mask, the shadow that a green point casts through it (the PSF), and the capture, in mm:
+
+tc.plot.mask(mask).savefig(FIGURES / "mask.png", dpi=110)
+psf = tc.plot.psf(camera, wavelength=532 * nm, object_distance=250.0)
+psf.savefig(FIGURES / "psf.png", dpi=110)
+tc.plot.capture(capture, sensor).savefig(FIGURES / "capture.png", dpi=110)
