@@ -77,6 +77,13 @@ raw_capture = counts(mosaic(colours * seen(SCENE)))
 raw_psf = counts(mosaic(colours * on_sensor(PSF)))
 larger = scipy.ndimage.zoom(PSF, 1.06, order=1)
 
+figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+for ax, (name, raw) in zip(axes, {"PSF": psf, "capture": capture}.items(), strict=True):
+    drawn = ax.imshow(raw[..., 1], cmap="gray")
+    ax.set(title=f"{name}, green", xlabel="x (pixels)", ylabel="y (pixels)")
+    figure.colorbar(drawn, ax=ax, label="counts")
+figure.savefig(FIGURES / "handed-in.png", dpi=110)
+
 # %%
 # Nine ways to hand them in
 # -------------------------
