@@ -183,7 +183,7 @@ for camera, (pitch, read, count, (steps, *numbers), lights) in cameras.items():
         rings = {name: over_rings(r, cells.frequencies, 40) for name, (_, r) in found.items()}
         rings["limit"] = over_rings(jnp.asarray(bound.ratio), cells.frequencies, 40)
         ratios[key], least[key] = rings, bound
-        lens = limit(problem, "amplitude").decibels
+        lens = limit(problem, masks="amplitude").decibels
         print(
             f"{camera}, {light}: limit {bound.decibels:.2f} dB (gap {bound.gap:.0e}), of", end=" "
         )

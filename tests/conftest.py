@@ -1,9 +1,7 @@
 """What every test runs with: float64, strict dtype promotion, checked types, no display."""
 
 import atexit
-import functools
 import gc
-import itertools
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -32,7 +30,6 @@ import jax
 import jaxtyping
 import pytest
 from checked_types import checked
-from jax._src.interpreters import mlir
 
 from helpers import ROOT
 
@@ -50,16 +47,6 @@ jax.config.update("jax_traceback_in_locations_limit", 0)  # lines in HLO that no
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "programs"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-# Each program is lowered in an MLIR context of its own, whose dialects take 3 ms to load: a fifth
-# of a small one's time. Here a hundred share theirs, which is dropped with the constants it holds;
-# one that is compiled while another is lowered has its own.
-contexts, made = itertools.count(), getattr(mlir, "make_ir_context", None)
-if made is not None:
-    shared = functools.lru_cache(1)(lambda _: made())
-    mlir.make_ir_context = lambda: (
-        shared(next(contexts) // 100) if mlir.ir.Context.current is None else made()
-    )
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.jaxtyped = checked

@@ -104,11 +104,11 @@ def test_longer_distances_wider_masks_and_shorter_waves_lower_it():
     for kind in KINDS:
         for name, (lower, upper, captures) in others.items():
             space = DesignSpace(base.space.base, (Variable(name, lower, upper, captures),))
-            lower_limit = limit(replace(base, space=space), kind).error
+            lower_limit = limit(replace(base, space=space), masks=kind).error
             if (kind, name) == ("shadow", "wavelength"):
-                assert lower_limit == limit(base, kind).error
+                assert lower_limit == limit(base, masks=kind).error
             else:
-                assert lower_limit < limit(base, kind).error
+                assert lower_limit < limit(base, masks=kind).error
 
 
 @pytest.mark.parametrize("noise", LIGHTS)
@@ -151,7 +151,7 @@ def test_shadows_reach_what_scipy_finds_for_the_convex_problem(noise):
 def test_a_lens_attains_the_limit_of_phase_masks():
     """|H| of a lens is the overlap of its aperture with itself (Fresnel)."""
     searched = problem(LIGHTS[2])
-    judge, found = ShadowJudge(searched, 4), limit(searched, "phase")
+    judge, found = ShadowJudge(searched, 4), limit(searched, masks="phase")
     axis = np.asarray(searched.best_data.frequencies.axis)
     along = 1.05 * (1.6 - 5e-4 * axis) * np.sinc(0.05 * axis / 5.0)
     known = judge.per_noise / judge.variance(np.ones((4, 4)), 1.0)
@@ -165,7 +165,7 @@ def test_zone_plates_keep_to_the_limit_of_amplitudes():
     """Which one that focuses on the sensor, a lens, nears, and passes that of shadows."""
     searched = problem(LIGHTS[2])
     focus = np.pi * 1.05 / (5e-4 * 5.0)
-    least = limit(searched, "amplitude")
+    least = limit(searched, masks="amplitude")
     for beta, profile in ((20.0, "cosine"), (focus / 2, "binary"), (focus, "binary")):
         one = shots([beta], 5.0, [0.3], wavelength=5e-4, width=1.6, profile=profile)
         error = float(searched.objective(one, searched.best_data))
@@ -177,7 +177,7 @@ def test_zone_plates_keep_to_the_limit_of_amplitudes():
 def test_no_fringes_pass_the_bound_of_amplitudes():
     """∫ t(ξ + s/2) t(ξ - s/2) e^{-2πjuξ} of drawn masks, transmitted along one axis."""
     searched, rng = problem(PhotonNoise(1e12, 0.0)), np.random.default_rng(3)
-    found, judge = limit(searched, "amplitude"), ShadowJudge(searched, 4)
+    found, judge = limit(searched, masks="amplitude"), ShadowJudge(searched, 4)
     axis = np.asarray(searched.best_data.frequencies.axis)
     cells, side = 1600, 1.6
     places = (np.arange(cells) - (cells - 1) / 2) * side / cells

@@ -71,7 +71,7 @@ class Limit:
 
 
 @checked
-def limit(problem: DesignProblem, masks: Masks = "shadow") -> Limit:
+def limit(problem: DesignProblem, *, masks: Masks = "shadow") -> Limit:
     """Least `bayes_error` of any masks in place of the zone apertures of a problem.
 
     The masks are as wide as the problem allows, at its longest distance and shortest wavelength;

@@ -351,7 +351,7 @@ def _limits(problem: DesignProblem) -> tuple[Limit, ...]:
     counted = isinstance(problem.data.setup.noise, PhotonNoise)
     if not (counted and isinstance(problem.objective, BayesError)):
         return ()
-    return limit(problem, "shadow"), limit(problem, "amplitude")
+    return limit(problem), limit(problem, masks="amplitude")
 
 
 @dataclass(frozen=True, eq=False)
