@@ -1,7 +1,6 @@
 """Imaging models: cameras whose PSFs are computed, or PSFs that were measured."""
 
 import functools
-import logging
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -320,10 +319,19 @@ def _require_light(psfs: Array) -> None:
             f"a PSF sums to {light.min():.3g}, which is negative: too large a background was "
             "subtracted, or its sign is wrong; give PSFs of positive irradiance"
         )
-    level, share = pedestal(values)
-    if level > 0:
-        text = "a PSF is %.3g where it is dark, %.0f %% of its mean: give tc.Psfs(psfs - %.3g)"
-        logging.getLogger(__name__).warning(text, level, 100 * share, level)
+
+
+def pedestal_of(model: object) -> str:
+    """A sentence where measured PSFs stand on a pedestal, with what to subtract, else nothing."""
+    if not isinstance(model, Psfs) or checks.is_traced(model.psfs):
+        return ""
+    level, share = pedestal(np.asarray(model.psfs))
+    if level == 0:
+        return ""
+    return (
+        f"a PSF is {level:.3g} where it is dark, {100 * share:.0f} % of its mean: give "
+        f"tc.Psfs(psfs - {level:.3g}), of files --psf-background"
+    )
 
 
 def registered_shape(shape: tuple[int, int], ratio: float) -> tuple[int, int]:

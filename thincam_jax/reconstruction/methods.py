@@ -9,6 +9,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
+from thincam_jax.reconstruction.imaging_model import pedestal_of
 from thincam_jax.reconstruction.iterate import Callback
 from thincam_jax.reconstruction.other_psf import negative_behind_operators
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -91,7 +92,8 @@ def _reconstruct(recording: Recording, solver, start, callback, tell) -> Reconst
         raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:
         result = solver.solve(recording)
-    return saying(result, reason, result.reason, negative_behind_operators(recording))
+    negative, level = negative_behind_operators(recording), pedestal_of(recording.imaging_model)
+    return saying(result, reason, result.reason, negative, level)
 
 
 @checked
