@@ -178,9 +178,9 @@ images = {(kind, name): reconstructed(kind, name) for kind in clean for name in 
 # Total variation with the PSF of every point
 # -------------------------------------------
 #
-# Of one capture: with the axis' convolution, and with the operator over the field, both by the same
-# solver, which is told that there is no background. The operator takes about five convolutions'
-# time.
+# Of one capture: with the axis' convolution, and with the operator over the field, by the same
+# solver. Both are told that there is no background. The operator takes as long as five
+# convolutions.
 
 shot = scan_far[0]
 shape = (field, field)

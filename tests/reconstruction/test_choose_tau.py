@@ -102,8 +102,12 @@ def test_a_wrong_psf_is_reported_and_does_not_lower_tau(rule):
     assert found.tau > 2.0
     errors = [float(mean_squared_error(r.image, truth[:, 0])) for r in (found, default)]
     assert errors[0] < errors[1]
-    right = tc.reconstruct(recording(problem.captures[0], field_shape=(38, 45)), tc.AdmmTV(rule))
+    seen = recording(problem.captures[0], field_shape=(38, 45))
+    right = tc.reconstruct(seen, tc.AdmmTV(rule))
     assert not right.reason and right.tau < 8.1
+    same = tc.reconstruct(seen, tc.AdmmTV(right.tau))
+    assert right.iterations == same.iterations
+    np.testing.assert_allclose(right.image, same.image, rtol=1e-6, atol=1e-9)
 
 
 SHAPE = (72, 96)

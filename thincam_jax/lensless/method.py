@@ -45,8 +45,7 @@ CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMP
 # of the far edge turn by up to 10 cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000
 # of the amplitude: 8 nodes are 2e-3 off there, 16 8e-5, 24 1e-10.
 PIXEL_NODES = 24
-# Fewer nodes, and the fringes a pixel up to which their averages are exact to
-# 1e-7 and 1e-13.
+# Fewer nodes, and the fringes a pixel up to which their averages are exact to 1e-7 and 1e-13.
 _FEWER: dict[Precision, dict[int, float]] = {
     "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
     "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},

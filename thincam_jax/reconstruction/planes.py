@@ -100,13 +100,16 @@ def with_smooth_light(
         return math.inf if left is None else max(left.smooth)
 
     again = minimise(outcome.image, min(_FIRST, most))
-    if again.status == "iterations_exhausted" and most > _FIRST and smooth(again) < _HOPEFUL:
+    left = smooth(again)
+    if again.status == "iterations_exhausted" and most > _FIRST and left < _HOPEFUL:
         again = again.followed_by(minimise(again.image, most - _FIRST))
+        left = smooth(again)
     seconds = outcome.seconds + again.seconds
     if again.status in ("stopped", "interrupted"):
         return dataclasses.replace(outcome, status=again.status, seconds=seconds)
-    is_right = again.status != "non_finite" and smooth(again) < _RIGHT
-    return dataclasses.replace(again if is_right else outcome, seconds=seconds)
+    if again.status != "non_finite" and left < _RIGHT:
+        outcome = dataclasses.replace(again, reason=outcome.reason)
+    return dataclasses.replace(outcome, seconds=seconds)
 
 
 def warn_of_equal_planes(operators: list[CropConvolution], weights: Sequence[Any]) -> None:

@@ -354,11 +354,11 @@ class Recording(Module):
         is_open = not isinstance(model, Cameras) and getattr(model, "field_shape", None) is None
         if not is_open or not squares.any():
             return bool(squares.any())
-        given = [] if checks.is_traced(noise) else [lambda: noise]
-        return any(
-            bool(np.any(squares > BY_NOISE**2 * np.asarray(variance())))
-            for variance in (*given, estimated)
-        )
+
+        def exceed(variance) -> bool:
+            return bool(np.any(squares > BY_NOISE**2 * np.asarray(variance)))
+
+        return (not checks.is_traced(noise) and exceed(noise)) or exceed(estimated())
 
     @property
     def shows_brightness(self) -> bool:

@@ -121,6 +121,7 @@ class AbstractRegularised(AbstractIterativeSolver):
         whole, unit = with_equal_planes(problem)
         image = first_image(whole, upright, uniform=uniform)
         problem = whole if unit is None else without_smooth_misfit(whole)
+        is_filtered = problem is not whole
         if unit is not None and upright is not None:
             image = image * unit
         if self.nonnegative:  # it is returned if no iterate is better
@@ -136,8 +137,7 @@ class AbstractRegularised(AbstractIterativeSolver):
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
-        is_still = outcome.status == "converged" or outcome.iterations > _SETTLED
-        if problem is not whole and is_still and _is_settled(outcome):
+        if is_filtered and _is_settled(outcome, _SETTLED + 1):
             whole = with_tau(whole, problem.tau)
 
             def minimise(image, iterations):
@@ -158,9 +158,9 @@ class AbstractRegularised(AbstractIterativeSolver):
         return reaching_beyond(solve, recording, problem, found, result, self.synthesis)
 
 
-def _is_settled(outcome: Outcome) -> bool:
+def _is_settled(outcome: Outcome, least: int = _SETTLED) -> bool:
     """Whether what an image leaves is misfit, not what more iterations would explain."""
-    done = outcome.status == "iterations_exhausted" and outcome.iterations >= _SETTLED
+    done = outcome.status == "iterations_exhausted" and outcome.iterations >= least
     return done or outcome.status == "converged"
 
 
