@@ -17,7 +17,7 @@ from test_prior import CASES, COUNT, PHOTOGRAPHS, SIDE
 
 import thincam_jax as tc
 from thincam_jax.imaging.metrics import align, psnr
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 
 NAMES = (
     "zone aperture, 100 mm",
@@ -44,7 +44,7 @@ def test_background(name, capsys):
     if not PHOTOGRAPHS.exists():
         pytest.skip(f"needs photographs in {PHOTOGRAPHS}")
     record = CASES[name]()
-    pictures = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images[:COUNT]
+    pictures = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE)[:COUNT]
     found = np.zeros((2, len(OFFSETS), len(ITERATIONS)))
     for seed, picture in enumerate(pictures):
         recording, truth = record(picture, "30", seed)
@@ -82,7 +82,7 @@ def test_cost_where_there_is_none(name, solver, capsys):
     """
     if not PHOTOGRAPHS.exists():
         pytest.skip(f"needs photographs in {PHOTOGRAPHS}")
-    pictures = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images[:MANY]
+    pictures = photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE)[:MANY]
     spent, gains, record = [], [], CASES[name]()
     for seed, picture in enumerate(pictures):
         recording, truth = record(picture, "30", seed)

@@ -9,7 +9,7 @@ from test_prior import PHOTOGRAPHS
 
 import thincam_jax as tc
 from thincam_jax.imaging.metrics import align, psnr
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 from thincam_jax.reconstruction.problem import forward
 
 SIDE = 512
@@ -29,7 +29,7 @@ def test_a_colour_capture(capsys):
     mask, sensor = tc.FresnelZoneAperture(25.0, width=5.6), tc.Sensor((SIDE, SIDE), 0.011)
     camera = tc.LenslessCamera(mask, sensor, 6.5)
     optics = tc.Cameras([camera], wavelength=5e-4, object_distance=250.0)
-    truth = np.stack(photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images[:3])
+    truth = np.stack(photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE)[:3])
     blank = tc.Recording(np.zeros((1, SIDE, SIDE)), optics, noise_variance=1.0).problem()
     seen = jnp.asarray(truth[:, ::-1, ::-1].astype(np.float32))[:, None]
     light = np.stack([np.asarray(forward(blank.operators[0], one[None])) for one in seen])

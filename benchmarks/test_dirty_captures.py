@@ -28,7 +28,7 @@ import thincam_jax as tc
 from thincam_jax.commands import cli
 from thincam_jax.imaging.operators import CropConvolution, Separable
 from thincam_jax.imaging.operators.low_rank import LowRank
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 from thincam_jax.reconstruction.other_psf import MIRRORED
 
 SHAPE, SIDE = (96, 128), 64
@@ -62,7 +62,7 @@ def cells(rng):
 
 @functools.cache
 def pictures():
-    return photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE).images
+    return photographs(PHOTOGRAPHS / "cc-by-sa/validation", SIDE)
 
 
 PSFS = {

@@ -25,7 +25,7 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 from thincam_jax.units import deg, mm, nm, um
 from thincam_jax.waveguide.distance import find_distances_of
 
@@ -86,7 +86,7 @@ def summary(found, truth):
 def test_distances_of_photographs(folder):
     if not (PHOTOGRAPHS / folder).is_dir():
         pytest.skip(f"no folder {PHOTOGRAPHS / folder}; THINCAM_PHOTOGRAPHS names another")
-    pictures = photographs(PHOTOGRAPHS / folder, CELLS).images[:COUNT]
+    pictures = photographs(PHOTOGRAPHS / folder, CELLS)[:COUNT]
     print(f"\n{folder}: {len(pictures)} photographs")
     print("scene            dB  determined  wrong  off in all  rms of error/stated  median mm")
     whole, wrong = 0, 0

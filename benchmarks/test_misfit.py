@@ -14,7 +14,7 @@ from test_background import score
 from test_prior import PHOTOGRAPHS
 
 import thincam_jax as tc
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 from thincam_jax.reconstruction import smooth_misfit
 from thincam_jax.reconstruction.problem import forward
 
@@ -127,7 +127,7 @@ def test_more_iterations_make_nothing_worse(name, capsys, monkeypatch):
         pytest.skip(f"needs photographs in {PHOTOGRAPHS}")
     optics, pixels = CAMERAS[name]()
     side = 112 if "field" in name else SIDE
-    picture = photographs(PHOTOGRAPHS / "cc-by-sa/validation", side).images[3]
+    picture = photographs(PHOTOGRAPHS / "cc-by-sa/validation", side)[3]
     for kind, part in CASES:
         recording, truth = recorded(optics, pixels, picture, kind, part)
         found = [tc.reconstruct(recording, tc.AdmmTV(iterations=n)) for n in ITERATIONS]

@@ -33,7 +33,7 @@ import others
 from test_background import score
 
 import thincam_jax as tc
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 from thincam_jax.units import nm
 
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
@@ -94,7 +94,7 @@ def exposures(psf):
     """(scene, capture) of every picture."""
     if not UNSEEN.is_dir():
         pytest.skip(f"needs photographs in {UNSEEN}")
-    images = photographs(UNSEEN, 80).images
+    images = photographs(UNSEEN, 80)
     for seed, index in enumerate(PICTURES):
         scene = np.zeros(SENSOR)
         scene[16:80, 20:100] = images[index][8:72]

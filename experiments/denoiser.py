@@ -22,7 +22,7 @@ from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 from thincam_jax import learn
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.learn.denoiser.pictures import drawn
-from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.learn.sources import photographs
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": few small drawn scenes, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "denoiser"
@@ -39,8 +39,8 @@ denoiser = learn.Denoiser.load(os.environ.get("THINCAM_NETWORK", "shipped"))
 
 LEVELS = (15 / 255, 25 / 255, 50 / 255)
 if SIZE == "full":
-    unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", 384).images[:24]
-    tuning = photographs(PHOTOGRAPHS / "cc0", 384).images[:24:4]
+    unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", 384)[:24]
+    tuning = photographs(PHOTOGRAPHS / "cc0", 384)[:24:4]
 else:
     unseen, tuning = (drawn(seed, 4).tiles[1:3, :48, :56, 0] for seed in (5, 6))
 

@@ -41,8 +41,6 @@ from thincam_jax.hardware.registry import driver
 from thincam_jax.hardware.stages.grbl import GrblStage
 from thincam_jax.hardware.stages.zaber import ZaberStage
 from thincam_jax.imaging.operators import Separable
-from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.network import NetworkOptions
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.measured import calibration
@@ -200,18 +198,6 @@ STUDIES = (
 )
 LEARNED = (
     call(TrainingOptions, steps=5, rate=1e-3, warm_up=2, averaging=0.9, seed=0, falling=0.5),
-    call(NetworkOptions, steps=2, widths=(8, 8)),
-    call(
-        RefocusCamera,
-        camera=camera(),
-        light=WAVE,
-        field_shape=(9, 12),
-        near=100.0,
-        far=300.0,
-        planes=3,
-        pupil=1.0,
-    ),
-    call(learn.RefocusNetwork.load, path="nothing", cameras=camera()),
     call(denoised, network="shipped", image=IMAGE, sigma=0.1),
     call(tc.PlugAndPlay, denoiser="shipped", strength=1.0, iterations=2, tolerance=1e-3),
 )

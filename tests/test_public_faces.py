@@ -30,7 +30,7 @@ MODULES = (
     *("design.end_to_end", "design.fronts", "design.match"),
     *("design.objectives", "design.phase_mask", "design.phase_retrieval"),
     *("waveguide.design.plate", "design.ranking", "design.sensitivity"),
-    *("design.training", "learn.refocusing.network", "learn.refocusing.train"),
+    "design.training",
     "lensless.masks.phase",
     *("waveguide.measured.screen_fit", "measured.exposures", "measured.sensor"),
     *("reconstruction.depth.find", "reconstruction.problem"),
@@ -39,7 +39,7 @@ MODULES = (
     *("waveguide.rays", "waveguide.screen_to_sensor"),
 )
 # Called by the package with keys that it draws, or inside jit.
-WITHIN = {"draw_batch", "linear_objective", "match_objective", "restored_objective"}
+WITHIN = {"linear_objective", "match_objective", "restored_objective"}
 WITHIN |= {"FrontSearch", "Training", "TrainingDescents", "adjoint_error"}
 
 

@@ -18,7 +18,7 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
   `PoissonGaussianNoise`
 - accuracy: `choose_model`, `predict_error`, `plan_capture`, `PsfMethod`
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
-  `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV`, `PlugAndPlay` or `Learned`; `Stream`
+  `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV` or `PlugAndPlay`; `Stream`
 - calibration: `fit_psf`, `check_psf`, `refine`, `measured`
 - experiments: `studies`, `design`, `learn`, `plot`, `explore`, `hardware`
 

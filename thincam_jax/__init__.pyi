@@ -20,7 +20,6 @@ from .imaging.sensor import PoissonGaussianNoise as PoissonGaussianNoise
 from .imaging.sensor import Sensor as Sensor
 from .imaging.targets.images import load_image as load_image
 from .learn.plug_and_play import PlugAndPlay as PlugAndPlay
-from .learn.refocusing.learned import Learned as Learned
 from .lensless.accuracy.select import choose_model as choose_model
 from .lensless.accuracy.select import predict_error as predict_error
 from .lensless.camera import LenslessCamera as LenslessCamera

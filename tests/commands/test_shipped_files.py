@@ -85,7 +85,7 @@ def options_of(path, folder):
     return []
 
 
-FZA = ("fza_field", "fza_refocus", "fza_superresolution", "learned_refocus")
+FZA = ("fza_field", "fza_refocus", "fza_superresolution")
 STS = ("stis", "sts_calibration", "sts_colours")
 
 

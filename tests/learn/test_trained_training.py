@@ -17,7 +17,7 @@ from helpers import ROOT
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.pictures import Pictures
 from thincam_jax.learn.imperfections import Imperfections
-from thincam_jax.learn.refocusing.sources import Entry
+from thincam_jax.learn.sources import Entry
 from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction, with_whole_field
 from thincam_jax.learn.trained_lessons import (
     CameraLessons,

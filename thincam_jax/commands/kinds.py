@@ -104,10 +104,6 @@ _ALL = {
         "rig_virtual",
         room="hardware",
     ),
-    "learned": Kind(
-        *("a network", "train", "refocusing:LearnedConfig", "training:lessons"),
-        *("learned_refocus", "refocusing:build_lessons", "refocusing:run_training", "learn"),
-    ),
     "denoiser": Kind(
         *("a denoiser", "train", "denoiser:DenoiserConfig", "training:lessons"),
         *("denoiser", "denoiser:build_lessons", "denoiser:run_denoiser", "learn"),

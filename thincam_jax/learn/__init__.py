@@ -1,4 +1,4 @@
-"""Learned parts: a denoiser, unrolled solvers, refocusing networks.
+"""Learned parts: a denoiser, unrolled solvers, reconstructions for one camera.
 
 The names stand in `__init__.pyi`; each is imported at its first use.
 """

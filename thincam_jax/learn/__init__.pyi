@@ -1,5 +1,4 @@
 """The names of `thincam_jax.learn`; `__init__.py` reads them from here."""
 
 from .denoiser.network import Denoiser as Denoiser
-from .refocusing.network import RefocusNetwork as RefocusNetwork
 from .unrolled import UnrolledAdmm as UnrolledAdmm

@@ -44,7 +44,7 @@ from thincam_jax.learn.checkpoint import (
     write_arrays,
 )
 from thincam_jax.learn.plug_and_play import PlugAndPlay
-from thincam_jax.learn.refocusing.unet import UNet
+from thincam_jax.learn.unet import UNet
 from thincam_jax.reconstruction.imaging_model import Psfs
 from thincam_jax.reconstruction.outside_light import pinned
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, or_one, residuals

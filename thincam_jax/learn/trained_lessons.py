@@ -16,7 +16,7 @@ from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.learn.denoiser import pictures
 from thincam_jax.learn.denoiser.pictures import Pictures
 from thincam_jax.learn.imperfections import Imperfections
-from thincam_jax.learn.refocusing.sources import Entry, dead_leaves
+from thincam_jax.learn.sources import Entry, dead_leaves
 from thincam_jax.learn.trained import PhysicsStep, operator_of, prepared, with_whole_field
 from thincam_jax.measured.pairs import PairedCapture, Pairs
 from thincam_jax.measured.preparation import Prepared

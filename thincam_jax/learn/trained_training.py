@@ -21,8 +21,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax.imaging.operators.crop_convolution import centred_crop
-from thincam_jax.learn.refocusing.sources import Entry, as_json
-from thincam_jax.learn.refocusing.unet import UNet
+from thincam_jax.learn.sources import Entry, as_json
 from thincam_jax.learn.trained import PhysicsStep, TrainedReconstruction, cleaned, refined
 from thincam_jax.learn.trained_lessons import CameraLessons, PairLessons, PreparedExamples
 from thincam_jax.learn.training import (
@@ -35,6 +34,7 @@ from thincam_jax.learn.training import (
     TrainingState,
     train_model,
 )
+from thincam_jax.learn.unet import UNet
 from thincam_jax.reconstruction.problem import InverseProblem, or_one
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.studies.agreement import agreement

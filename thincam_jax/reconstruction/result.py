@@ -22,9 +22,6 @@ class Reconstruction(Module):
     - `history`: objective and residuals along the way; see `Progress`.
     - `iterations`, `seconds`: done and taken; compilation is part of the time.
     - `tau`: the relative τ used, as given or found; None for methods without.
-    - `consistency`, `confidence`: measures of trust in a learned method, which may make things up:
-      residual of the explained capture, root mean square, over the noise's deviation, for each
-      element of the batch; and how sure it is of each pixel, 0 to 1, (*batch, y, x).
     """
 
     image: Float[Array, "*batch y x"]
@@ -36,8 +33,6 @@ class Reconstruction(Module):
     iterations: int = eqx.field(static=True, default=0)
     seconds: float = eqx.field(static=True, default=0.0)
     tau: float | None = eqx.field(static=True, default=None)
-    consistency: Float[Array, "*capture"] | None = None
-    confidence: Float[Array, "*capture y x"] | None = None
 
     @property
     def status(self) -> str:

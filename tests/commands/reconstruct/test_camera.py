@@ -20,7 +20,7 @@ def files(tmp_path):
     study = tiny.built(tmp_path, "object.distance=40 mm")
     seen = np.asarray(take(study, study.exposures[0], study.targets[1]).image)[1]
     simulated.write_tiff(tmp_path / "capture.tif", simulated.counts(seen))
-    whole = computed_psf(read_camera(tmp_path / "tiny.yaml", (), 40.0), "tiny")
+    whole = computed_psf(read_camera(tmp_path / "tiny.yaml", ("object.distance=40 mm",)), "tiny")
     np.save(tmp_path / "psf.npy", whole.pixels)  # also what the shadow has beyond the sensor
     names = {"study": "tiny.yaml", "capture": "capture.tif", "psf": "psf.npy"}
     return {name: tmp_path / file for name, file in names.items()}
@@ -67,7 +67,7 @@ def test_what_does_not_go_together(files):
 @pytest.mark.thorough
 def test_psf_of_a_mask_larger_than_the_sensor_is_whole(files):
     wide = ("mask.width=5mm", "--set", "object.distance=40mm")
-    cameras = read_camera(files["study"], wide[::2], None)
+    cameras = read_camera(files["study"], wide[::2])
     found = computed_psf(cameras, "tiny")
     (camera,) = cameras.cameras
     camera = camera.on_grid(camera.sensor.grid.with_shape((200, 200)))

@@ -82,7 +82,7 @@ def test_intervals_are_written_and_drawn(grey, tmp_path):
 def test_intervals_that_do_not_fit_are_told(grey, tmp_path):
     out, (_, path) = tmp_path / "image.png", intervals_of(tmp_path)
     full = call(grey, out, "--intervals", path, "--field", "full")
-    assert "leave out --distances, --network and --field" in one_line(full)
+    assert "leave out --distances and --field" in one_line(full)
     missing = one_line(call(grey, out, "--intervals", tmp_path / "no.json"))
     assert "no.json: is missing; give intervals/METHOD.json" in missing
     path.write_text("{}", "utf-8")

@@ -3,8 +3,9 @@
 import json
 
 import pytest
-from learn.commands.test_train import call, line
+from typer.testing import CliRunner
 
+from thincam_jax.commands import cli
 from thincam_jax.learn.denoiser.network import network_card
 from thincam_jax.learn.denoiser.train import NETWORK, STATE
 
@@ -16,6 +17,16 @@ sources:
 network: {widths: [4], blocks: [1]}
 training: {steps: 4, batch: 2, crop: 8, judged: 1, check_every: 2, warm_up: 1}
 """
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli.app, ["train", *(str(a) for a in arguments)])
+
+
+def line(result):
+    assert result.exit_code == 2, result.output
+    (only,) = result.stderr.splitlines()
+    return only.removeprefix("thincam: ")
 
 
 @pytest.fixture
@@ -61,6 +72,12 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     assert call(file, "--out", tmp_path / "d", *start).exit_code == 0
 
 
+def test_what_is_there_is_not_lost_and_what_is_not_cannot_be_gone_on_with(file, tmp_path):
+    assert "holds no training yet" in line(call(file, "--out", tmp_path, "--resume"))
+    (tmp_path / STATE).touch()
+    assert "give --resume to go on with it" in line(call(file, "--out", tmp_path))
+
+
 def test_what_cannot_be_used_is_told(file, tmp_path):
     def told(setting):
         return line(call(file, "--out", tmp_path / "out", "--set", setting))
@@ -70,5 +87,7 @@ def test_what_cannot_be_used_is_told(file, tmp_path):
     assert "give as many as widths, one for each of up to 16" in told("network.blocks=[1, 2]")
     assert "held_out names 'dog'; there are drawn" in told("sources.0.held_out=[dog]")
     assert "none of them is of use 'train'" in told("sources.0.use=judge")
+    assert "kind drawn takes no 'path'" in told("sources.0.path=there")
+    assert "kind folder needs 'path'" in told("sources.0.kind=folder")
     assert "none is left to train on" in told("sources.0.held_out=[drawn]")
     assert not (tmp_path / "out").exists()

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from learn.commands.test_train import call, line
+from learn.commands.test_train_denoiser import call, line
 from learn.test_trained import drawn_psf
 from typer.testing import CliRunner
 

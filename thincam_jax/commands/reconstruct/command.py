@@ -167,16 +167,6 @@ def reconstruct(
         Path | None,
         Option(help="Study (YAML) whose first shot describes the camera, in place of --psf."),
     ] = None,
-    network: Annotated[
-        Path | None,
-        Option(help="Network of 'thincam train' for --camera, or 'shipped', in place of --method."),
-    ] = None,
-    distance: Annotated[
-        str | None,
-        Option(
-            help="Distance at which a network focuses, such as 120mm. Default: the study's object."
-        ),
-    ] = None,
     set_: Overrides = None,
     *,
     files: ImageOptions,
@@ -223,9 +213,8 @@ def reconstruct(
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
         from thincam_jax.commands.reconstruct.run import run_with_bar
 
-        known, focusing = options.known_psf(psf or (), camera, set_, network, distance)
         sources = options.Sources(
-            known,
+            options.known_psf(psf or (), camera, set_),
             options.read_background(files.background),
             0.0 if camera else options.read_background(files.psf_background),
             files.dead,
@@ -236,11 +225,10 @@ def reconstruct(
             options.read_exposures(exposure or (), len(psf or ()), len(capture)),
         )
         name, settings = options.read_method(method), vars(solver)
-        recipe = options.Recipe(name, field=field, flip=flip, focusing=focusing, **settings)
-        balance, unsure = options.read_white_balance(white_balance), focusing is not None
-        one = not (distances or network)
-        ends = options.read_intervals(intervals, one, field)
-        output = options.Output(out, linear, gamma, balance, unsure, ends)
+        recipe = options.Recipe(name, field=field, flip=flip, **settings)
+        balance = options.read_white_balance(white_balance)
+        ends = options.read_intervals(intervals, not distances, field)
+        output = options.Output(out, linear, gamma, balance, ends)
         jobs = plan_jobs(capture[0], sources, output, tuple(capture[1:]))
         end = run_with_bar(jobs, sources, recipe, output)
     if end:

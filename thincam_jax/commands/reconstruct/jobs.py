@@ -185,9 +185,9 @@ def _jobs_of(capture: Path, path: Path, sources: Sources, output: Output) -> lis
     images = _images(path, output)
     if not sources.distances:
         linear = next((p.suffix for p in images if p.suffix.lower() in LINEAR), ".npy")
-        names = ["-unsure.png"] if output.unsure else []
+        names: list[str] = []
         if output.intervals is not None:
-            names += [f"-lower{linear}", f"-upper{linear}", "-width.png"]
+            names = [f"-lower{linear}", f"-upper{linear}", "-width.png"]
         beside = tuple(path.with_name(f"{path.stem}{name}") for name in names)
         return [Job(capture, images, beside=beside)]
     jobs = []

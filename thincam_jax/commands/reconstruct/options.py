@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from thincam_jax._core import checks
-from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
+from thincam_jax.commands.kinds import load_study
 from thincam_jax.commands.reconstruct import METHODS
 from thincam_jax.commands.study.build import assemble, check_optics
 from thincam_jax.measured import MeasurementError, Preparation, Raw
@@ -77,18 +76,6 @@ class Sources:
         return paths + [file for path in paths if path.is_dir() for file in image_files(path)]
 
 
-@dataclass(frozen=True)
-class Focusing:
-    """A network in place of a solver, and the distance that its images are focused on, mm.
-
-    - `network`: a `RefocusNetwork`, not named here: other methods need not wait for its import.
-    """
-
-    path: Path
-    network: Any
-    distance: float
-
-
 def is_trained(method: str) -> bool:
     """Whether a method is the file of a trained reconstruction."""
     return method.endswith(_TRAINED)
@@ -120,7 +107,6 @@ class Recipe:
     - `flip`: turn the image by 180°.
     - `ridge`: strength of the method "ridge", which has neither tau nor coupling; None: 1.
     - `noise`: standard deviation of a raw pixel's noise, counts; None: estimated.
-    - `focusing`: a network; `method` is then "learned", and nothing else of it is used.
     - `strict`: severe findings of the examination are errors.
 
     **Errors**: MeasurementError for what is unknown or out of range.
@@ -134,7 +120,6 @@ class Recipe:
     flip: bool = False
     ridge: float | int | None = None
     noise: float | int | None = None
-    focusing: Focusing | None = None
     strict: bool = False
 
     def __post_init__(self):
@@ -192,11 +177,6 @@ class Recipe:
 
     def _check_method(self) -> None:
         """Whether it is one, works from prepared captures, and uses what is given."""
-        if self.focusing is not None:
-            for name in ("coupling", "tau", "ridge"):
-                if getattr(self, name) is not None:
-                    raise MeasurementError(f"--network has no {name}; leave one of both out")
-            return
         if is_trained(self.method):
             for name in ("coupling", "tau", "ridge", "iterations"):
                 if getattr(self, name) is not None:
@@ -231,7 +211,6 @@ class Output:
     - `path`: an image file; or a folder, in which each result has the name of its capture.
     - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
     - `gamma`, `white_balance`: encoding of the PNG; see `measured.to_display`.
-    - `unsure`: also NAME-unsure.png, a learned image with what is not sure in red.
     - `intervals`: calibrated by 'thincam evaluate'; also NAME-lower and NAME-upper, linear, their
       ends at each pixel, and NAME-width.png, a map of their widths.
     """
@@ -240,7 +219,6 @@ class Output:
     linear: Literal["npy", "tif", "none"] = "npy"
     gamma: float | int = 2.2
     white_balance: WhiteBalance = None
-    unsure: bool = False
     intervals: Intervals | None = None
 
 
@@ -253,7 +231,7 @@ def read_intervals(path: Path | None, one_method: bool, field: str) -> Intervals
         return None
     if not one_method or field != "sensor":
         text = "are of one PSF, a --method and the sensor's field"
-        raise MeasurementError(f"--intervals {text}; leave out --distances, --network and --field")
+        raise MeasurementError(f"--intervals {text}; leave out --distances and --field")
     try:
         return Intervals.load(path)
     except FileNotFoundError:
@@ -274,34 +252,22 @@ def read_background(text: str | None) -> Background:
 
 
 def known_psf(
-    psf: Sequence[Path],
-    camera: Path | None,
-    overrides: list[str] | None,
-    network: Path | None,
-    distance: str | None,
-) -> tuple[Path | Raw | tuple[Path, ...], Focusing | None]:
-    """The files of a measured PSF; or the PSF of a camera, and its network.
+    psf: Sequence[Path], camera: Path | None, overrides: list[str] | None
+) -> Path | Raw | tuple[Path, ...]:
+    """The files of a measured PSF; or the PSF of a camera.
 
-    **Errors**: MeasurementError where not one is given; ConfigError of the camera and the network.
+    **Errors**: MeasurementError where not one is given; ConfigError of the camera.
     """
     if bool(psf) == (camera is not None):
         raise MeasurementError(
             "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
         )
-    if distance is not None and network is None:
-        raise MeasurementError("--distance is that of a --network; see --distances for others")
     if psf:
         if overrides:
             raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
-        if network is not None:
-            raise MeasurementError("--network is of a camera; give --camera in place of --psf")
-        return psf[0] if len(psf) == 1 else tuple(psf), None
+        return psf[0] if len(psf) == 1 else tuple(psf)
     assert camera is not None
-    with read_as("--distance"):
-        focused = None if distance is None else parse_quantity(distance, "length")
-    cameras = read_camera(camera, overrides or (), focused)
-    focusing = None if network is None else read_network(network, cameras)
-    return computed_psf(cameras, f"camera of {camera}"), focusing
+    return computed_psf(read_camera(camera, overrides or ()), f"camera of {camera}")
 
 
 def read_exposures(texts: Sequence[str], *counts: int) -> tuple[float, ...]:
@@ -379,46 +345,18 @@ def read_white_balance(text: str | None) -> WhiteBalance:
     return red, green, blue
 
 
-def read_camera(config: Path, overrides: Sequence[str], distance: float | None) -> Cameras:
-    """The camera of a study's first shot, or of a file of kind learned, and its object's distance.
+def read_camera(config: Path, overrides: Sequence[str]) -> Cameras:
+    """The camera of a study's first shot, and its object's distance.
 
-    `distance`: in place of that of a study's object, mm.
-
-    **Errors**: ConfigError, as of `load_experiment`, and for a file of another kind or without
-    a distance.
+    **Errors**: ConfigError, as of `load_study`.
     """
-    if read_kind(config) is KINDS["learned"]:
-        # Here: other captures need not wait for the learned parts.
-        from thincam_jax.learn.commands.refocusing import build_camera
-
-        whole = build_camera(load_experiment(config, tuple(overrides), "train"))
-        if distance is None:
-            raise ConfigError(f"{config}: tells no object's distance; give a --distance")
-        light = {"wavelength": float(whole.light.wavelengths[0]), "model": whole.model}
-        return Cameras([whole.camera], object_distance=distance, **light)
     study = assemble(load_study(config, tuple(overrides), "a camera is read from a study"))
     check_optics(study)
     shot = study.exposures[0]
     return Cameras(
         [study.camera(shot)],
         wavelength=shot.wavelength,
-        object_distance=study.object_distance if distance is None else distance,
+        object_distance=study.object_distance,
         model=study.model,
         pixel_integration=study.pixel_integration,
     )
-
-
-def read_network(path: Path, cameras: Cameras) -> Focusing:
-    """A network and the distance that it is to be focused on, checked before any work.
-
-    **Errors**: ConfigError for a damaged file, another camera, and a distance outside of the range.
-    """
-    # Here: other captures need not wait for the learned parts.
-    from thincam_jax.learn.refocusing.network import RefocusNetwork
-
-    try:
-        network = RefocusNetwork.load(path, cameras)
-        network.camera.within(cameras.object_distance)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    return Focusing(path, network, float(cameras.object_distance))

@@ -16,7 +16,7 @@ from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.jobs import Inputs, Job, write_job
-from thincam_jax.commands.reconstruct.options import Focusing, Output, Recipe, Sources, is_trained
+from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources, is_trained
 from thincam_jax.commands.terminal import (
     INTERRUPTED,
     WRONG_INPUT,
@@ -60,7 +60,6 @@ class Finished:
     - `line`: a line that says what was done. `doubt`: fault with an image that does not explain
       its capture, or nothing.
     - `status`: see `Reconstruction.status`.
-    - `marked`: the image with its uncertain pixels marked, as a PNG.
     - `findings`: faults that residual and noise show.
     """
 
@@ -71,7 +70,6 @@ class Finished:
     doubt: str = ""
     status: str = ""
     iterations: int = 0
-    marked: bytes = b""
     findings: tuple[Finding, ...] = ()
 
 
@@ -122,18 +120,11 @@ def _run_job(
 ) -> Finished:
     began = time.perf_counter()
     examined, background = rig.examine(job)
-    known = background not in (None, "found") or examined.captures[0].black_level is not None
-    if recipe.focusing is not None and not known:
-        text = f"{job.capture}: a network finds no background, as solvers do; give --background, a"
-        raise measured.MeasurementError(f"{text} dark frame or a number of counts")
     ready = rig.ready(examined, background)
     _check_channels(job, ready, recipe, output)
     rig.tell(examined.findings, recipe.strict)
     noise = pixel_noise(ready, recipe.noise)
-    if recipe.focusing is None:
-        made = _reconstruct(job, ready, recipe, noise, report)
-    else:
-        made = _focus(job, ready, recipe.focusing, noise)
+    made = _reconstruct(job, ready, recipe, noise, report)
     rig.tell(() if made.doubt and not recipe.strict else made.findings, recipe.strict)
     findings = (*examined.findings, *made.findings)
     image = made.image[:, ::-1, ::-1] if recipe.flip else made.image
@@ -156,7 +147,7 @@ def _run_job(
         "display": shown if job.is_shown else None,
         "environment": environment(time.perf_counter() - began),
     }
-    beside = {job.beside[0]: made.marked} if made.marked else {}
+    beside: dict[Path, bytes] = {}
     if (intervals := output.intervals) is not None:
         beside, width = _ends(job, intervals.of(np.asarray(image, float)))
         known = {"probability": intervals.probability, "pictures": intervals.pictures}
@@ -253,7 +244,7 @@ def _reconstruct(
     )
     image, facts = done.image(recipe.field), _facts(done, recipe)
     findings = () if found.status == "interrupted" else tuple(_doubts(job, ready, done))
-    ending = found.status, found.iterations, b"", findings
+    ending = found.status, found.iterations, findings
     return Finished(job, facts, image, line, doubt, *ending)
 
 
@@ -293,46 +284,6 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
         "nonnegative": problem.nonnegative and not recipe.is_ridge,
         "iterations_at_most": getattr(done.solver, "iterations", None),
     }
-
-
-def _focus(job: Job, ready: Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
-    """The image of a network; its record is of the method alone."""
-    from thincam_jax.learn.plot import draw_unsure
-    from thincam_jax.learn.refocusing.learned import SURE, doubt, read
-    from thincam_jax.plot.frame import as_png
-
-    began = time.perf_counter()
-    if not ready.valid.all():
-        raise measured.MeasurementError(
-            f"{int((~ready.valid).sum())} pixels of the capture are dead or saturated, and a "
-            "network needs every pixel; repair them, or use another method"
-        )
-    try:
-        found = read(focusing.network, ready.capture, [focusing.distance], noise.deviation)
-    except ValueError as error:
-        raise measured.MeasurementError(f"{focusing.path}: {error}") from None
-    image = np.asarray(found.images[:, 0], np.float32)
-    unsure = np.asarray(found.confidence) < SURE
-    consistency, part = float(found.consistency.max()), float(unsure.mean())
-    status = "ok" if np.isfinite(image).all() else "non_finite"
-    seconds, words = round(time.perf_counter() - began, 3), doubt(consistency)
-    facts = {
-        "method": "learned",
-        "network": focusing.path,
-        "focused_on_mm": focusing.distance,
-        "status": status,
-        "consistency": consistency,
-        "doubt": words,
-        "unsure": part,
-        "iterations": 0,
-        "seconds": seconds,
-    }
-    line = (
-        f"focused on {focusing.distance:g} mm, residual {consistency:.2f} of the noise, not sure "
-        f"of {100 * part:.0f} % of the pixels, {seconds:.1f} s"
-    )
-    marked = as_png(draw_unsure(image, unsure))
-    return Finished(job, facts, image, line, words, status, marked=marked)
 
 
 def _check_channels(job: Job, ready: Prepared, recipe: Recipe, output: Output) -> None:

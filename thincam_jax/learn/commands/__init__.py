@@ -1,1 +1,1 @@
-"""Experiments of `kind: learned` and `kind: denoiser`: networks and their training."""
+"""Experiments of `kind: denoiser` and `kind: trained`: networks and their training."""

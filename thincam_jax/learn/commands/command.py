@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 def train(
     config: Annotated[
-        Path,
-        typer.Argument(help="Experiment file (YAML) of kind 'learned', 'denoiser' or 'trained'."),
+        Path, typer.Argument(help="Experiment file (YAML) of kind 'denoiser' or 'trained'.")
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results. Default: runs/NAME.")
@@ -25,7 +24,7 @@ def train(
     set_: Overrides = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Train a refocusing network, a denoiser or a reconstruction.
+    """Train a denoiser or a reconstruction.
 
     Writes network.thincam, figures and training.json. Ctrl-C, or a power cut, loses what was done
     since the last check; --resume goes on from there, to the same numbers.
@@ -59,4 +58,4 @@ def train(
     say_result("network", found.network)
 
 
-COMMANDS = ((train, "train learned.yaml", "train learned.yaml --resume"),)
+COMMANDS = ((train, "train denoiser.yaml", "train denoiser.yaml --resume"),)

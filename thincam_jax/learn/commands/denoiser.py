@@ -9,6 +9,7 @@ from pydantic import Field
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import to_json
 from thincam_jax.commands.schema import section
+from thincam_jax.learn import sources, unet
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.commands.training import (
     TRAINING,
@@ -29,7 +30,6 @@ from thincam_jax.learn.denoiser.network import (
 from thincam_jax.learn.denoiser.pictures import Pictures, united
 from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
 from thincam_jax.learn.plot import draw_losses
-from thincam_jax.learn.refocusing import sources, unet
 from thincam_jax.learn.training import TrainingOptions
 
 

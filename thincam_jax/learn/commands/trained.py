@@ -31,9 +31,7 @@ from thincam_jax.learn.commands.training import (
 )
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.plot import draw_losses
-from thincam_jax.learn.refocusing.learned import finite
-from thincam_jax.learn.refocusing.sources import as_json, from_json
-from thincam_jax.learn.refocusing.unet import parameter_count
+from thincam_jax.learn.sources import as_json, from_json
 from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction, training_record
 from thincam_jax.learn.trained_lessons import CameraLessons, PairLessons
 from thincam_jax.learn.trained_training import (
@@ -43,6 +41,7 @@ from thincam_jax.learn.trained_training import (
     train_reconstruction,
 )
 from thincam_jax.learn.training import TrainingOptions
+from thincam_jax.learn.unet import parameter_count
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.measured.layouts import open_pairs
 
@@ -228,6 +227,11 @@ def _pairs(config: TrainedConfig) -> tuple[PairLessons, PairLessons]:
 
 def _ready(asked: str, pair: Any) -> Any:
     return prepared_pair(asked, pair)[0]
+
+
+def finite(value: Any) -> float | None:
+    """Number to four decimals; None where it is not finite, which JSON has no number for."""
+    return round(float(value), 4) if np.isfinite(value) else None
 
 
 def _page(

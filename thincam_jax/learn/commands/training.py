@@ -14,7 +14,7 @@ from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sections import ExperimentConfig, Name, check_keys, check_names
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.refocusing.sources import Entry
+from thincam_jax.learn.sources import Entry
 from thincam_jax.learn.training import NETWORK, Trained, TrainingOptions, TrainingProgress
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -40,13 +40,13 @@ class SourceConfig(Section):
         check_keys(self, path="folder", count="drawn")
         return self
 
-    def images(self, maker: Any, *side: int) -> Any:
-        """Images by a module's functions, one for each kind, at a side if it takes one."""
+    def images(self, maker: Any) -> Any:
+        """Images by a module's functions, one for each kind."""
         if self.kind == "drawn":
-            return maker.drawn(self.seed, self.count, *side)
+            return maker.drawn(self.seed, self.count)
         if self.kind == "samples":
-            return maker.samples(*side)
-        return maker.photographs(self.path, *side, licence=self.licence)
+            return maker.samples()
+        return maker.photographs(self.path, licence=self.licence)
 
 
 class LearningConfig(ExperimentConfig):

@@ -24,8 +24,8 @@ from thincam_jax.learn.checkpoint import (
     read_weights,
     write_arrays,
 )
-from thincam_jax.learn.refocusing.sources import Entry, from_json
-from thincam_jax.learn.refocusing.unet import blocks_to_channels, channels_to_blocks, convolved
+from thincam_jax.learn.sources import Entry, from_json
+from thincam_jax.learn.unet import blocks_to_channels, channels_to_blocks, convolved
 
 _IMAGES = 5  # of the input: the four pixels of a block, and the noise level
 

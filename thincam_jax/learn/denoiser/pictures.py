@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from thincam_jax.imaging.encoding import decode_srgb
 from thincam_jax.imaging.targets import resize
-from thincam_jax.learn.refocusing.sources import Entry, dead_leaves, read_photographs, read_samples
+from thincam_jax.learn.sources import Entry, dead_leaves, read_photographs, read_samples
 
 TILE = 192  # pixels
 # Reduced photographs are sharper and hold less noise of their own; each halves the number of tiles.

@@ -22,7 +22,7 @@ from thincam_jax.learn.denoiser.reconstructions import (
     loss,
     reconstruction_loss,
 )
-from thincam_jax.learn.refocusing.sources import Entry, as_json
+from thincam_jax.learn.sources import Entry, as_json
 from thincam_jax.learn.training import (
     NETWORK,
     Task,

@@ -1,4 +1,4 @@
-"""Images that scenes are made of: photographs, scikit-image's own, drawn ones."""
+"""Images to learn from and to judge by: photographs, scikit-image's own, drawn ones."""
 
 import hashlib
 import os
@@ -99,48 +99,29 @@ def from_json(images: dict[str, list[dict[str, str]]]) -> dict[str, tuple[Entry,
     return {use: tuple(Entry(**one) for one in entries) for use, entries in images.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """Images of equal size to draw scenes from, and where they are from.
-
-    - `images`: (image, side, side), linear radiance from 0 to 1.
-    - `manifest`: an entry for each; one for all drawn ones.
-    """
-
-    images: Float32[np.ndarray, "image side side"]
-    manifest: tuple[Entry, ...]
-
-    def __add__(self, other: "Source") -> "Source":
-        images = np.concatenate([self.images, other.images])
-        return Source(images, self.manifest + other.manifest)
-
-
-def photographs(folder: str | os.PathLike[str], side: int, *, licence: str = "") -> Source:
-    """The images of a folder, in the order of their names.
+def photographs(
+    folder: str | os.PathLike[str], side: int
+) -> Float32[np.ndarray, "image side side"]:
+    """The images of a folder, in the order of their names: linear radiance from 0 to 1.
 
     sRGB is linearised, colours become luminance, and the middle square is reduced to `side` pixels.
-    `licence`: default the first line of the folder's LICENSE file, else "unknown".
     """
-    images, entries = zip(*read_photographs(folder, licence), strict=True)
-    return Source(np.stack([_square(image, side) for image in images]), entries)
+    return np.stack([_square(image, side) for image, _ in read_photographs(folder)])
 
 
 def read_photographs(
     folder: str | os.PathLike[str], licence: str = ""
 ) -> list[tuple[np.ndarray, Entry]]:
-    """The images of a folder as in their files, from 0 to 1; see `photographs`."""
+    """The images of a folder as in their files, from 0 to 1.
+
+    `licence`: default the first line of the folder's LICENSE file, else "unknown".
+    """
     files = photograph_files(folder)
     licence = licence or _licence(Path(folder))
     entries = [Entry(path.name, file_digest(path), licence) for path in files]
     return [
         (load_image(path, linear=True), entry) for path, entry in zip(files, entries, strict=True)
     ]
-
-
-def samples(side: int) -> Source:
-    """scikit-image's own photographs, as `photographs`."""
-    images, entries = zip(*read_samples(), strict=True)
-    return Source(np.stack([_square(image, side) for image in images]), entries)
 
 
 def read_samples() -> list[tuple[np.ndarray, Entry]]:
@@ -151,13 +132,6 @@ def read_samples() -> list[tuple[np.ndarray, Entry]]:
     named = zip(_SAMPLES, digests, strict=True)
     entries = [Entry(f"skimage:{name}", digest, licence) for name, digest in named]
     return list(zip(images, entries, strict=True))
-
-
-def drawn(seed: int, count: int, side: int) -> Source:
-    """`dead_leaves` as a source."""
-    images = dead_leaves(seed, count, side)
-    digest = hashlib.sha256(images.tobytes()).hexdigest()
-    return Source(images, (Entry(f"dead leaves, seed {seed}, {count} images", digest, "drawn"),))
 
 
 def _square(image: np.ndarray, side: int) -> Float32[np.ndarray, "side side"]:
