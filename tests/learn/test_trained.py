@@ -75,10 +75,11 @@ def test_untrained_it_gives_the_image_of_its_physics_step():
     assert np.corrcoef(np.ravel(found.image), np.ravel(scene))[0, 1] > 0.8
 
 
-def test_plug_and_play_may_be_the_physics_step(tmp_path):
+@pytest.mark.parametrize("method", ["pnp", "both"])
+def test_plug_and_play_may_be_the_physics_step(method, tmp_path):
     """Also of a file; one of a version before has none, and total variation."""
     recording, _ = recorded()
-    options = dataclasses.replace(OPTIONS, method="pnp")
+    options = dataclasses.replace(OPTIONS, method=method)
     untrained = TrainedReconstruction.create(options, PSF, key=0)
     found = tc.reconstruct(recording, untrained).image
     like = tc.reconstruct(with_whole_field(recording), tc.PlugAndPlay()).image
@@ -93,13 +94,30 @@ def test_plug_and_play_may_be_the_physics_step(tmp_path):
         TrainedOptions(method="wiener")
 
 
+def test_the_network_sees_the_images_of_both_methods():
+    recording, _ = recorded()
+    options = dataclasses.replace(OPTIONS, method="both")
+    both = TrainedReconstruction.create(options, PSF, key=0)
+    problem, images = both.physics(recording)
+    seen, unit = prepared(both.physics, problem, images)
+    assert seen.shape == (3, 1, 24, 32)
+    for one, solver in zip(seen[1:], (tc.AdmmTV(iterations=6), tc.PlugAndPlay()), strict=True):
+        like = tc.reconstruct(with_whole_field(recording), solver).image
+        y, x = ((n - m) // 2 for n, m in zip(like.shape[-2:], (24, 32), strict=True))
+        np.testing.assert_allclose(unit[0] * one, like[..., y : y + 24, x : x + 32], atol=1e-5)
+    mended = changed(both)
+    at_once = completed(mended.physics, mended.network, problem, images)
+    swapped = completed(mended.physics, mended.network, problem, (images[1], images[1]))
+    assert np.abs(at_once - swapped).max() > 1e-4  # the first image counts, too
+
+
 def test_the_second_image_gives_back_what_the_first_one_left():
     """With the right PSF the filtered residual brings the image nearer to the capture."""
     recording, _ = recorded()
     weak = dataclasses.replace(
         TrainedReconstruction.create(OPTIONS, PSF, key=0).physics, noise=jnp.asarray([-2.0])
     )
-    problem, image = weak(recording)
+    problem, (image,) = weak(recording)
     from thincam_jax.learn.trained import refined
     from thincam_jax.reconstruction.problem import relative_residual
 

@@ -3,15 +3,15 @@ r"""A reconstruction trained for one camera: a physics step, then a small U-Net.
 The physics step inverts the camera's model; the network removes what that leaves where the model is
 wrong and the capture noisy (Khan et al., FlatNet, IEEE Trans. Pattern Anal. 44, 1934, 2022;
 Monakhova et al., Opt. Express 27, 28075, 2019; Zeng and Lam, MWDN, IEEE Trans. Comput. Imaging 7,
-1156, 2021). It is some iterations of `AdmmTV`, or `PlugAndPlay`, which know of the crop, the
+1156, 2021). It is some iterations of `AdmmTV`, `PlugAndPlay`, or both, which know of the crop, the
 background and the noise, and the Wiener filter of what their image f leaves of the capture g,
 
 .. math:: f_W = f + F^{-1}\Big[\frac{\bar H}{|H|^2 + \lambda\,\overline{|H|^2}/S}\,
     F (g - A f - b)\Big]
 
 for a scene of the power spectrum S, ∝ 1/(1 + u²), which gives back the detail that they took for
-noise. Its relative noise λ is learned for each colour. The network sees both images and
-adds what is missing to f.
+noise. Its relative noise λ is learned for each colour. The network sees all these images and
+adds what is missing to f, that of plug and play where there are two.
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ _SHIFTED = 8  # part of its sides by which another one may be shifted
 # Correlation of the PSF with that of the training, below which it is another camera's, and below
 # which it may be. One that is 2 % too large or blurred by a pixel keeps more.
 _ANOTHER, _DOUBTED = 0.6, 0.9
-_IMAGES = 2  # of the physics step
+_IMAGES = {"admm_tv": 2, "pnp": 2, "both": 3}  # that the network sees
 _WHITE = 99.5  # percentile of an image that is 1 for the network
 
 
@@ -70,7 +70,8 @@ _WHITE = 99.5  # percentile of an image that is 1 for the network
 class TrainedOptions:
     """Size of the physics step and of the network.
 
-    - `method`: "admm_tv", or "pnp", `PlugAndPlay` as it is, which is six times as slow.
+    - `method`: "admm_tv"; "pnp", `PlugAndPlay` as it is, which is six times as slow; or "both",
+      which are wrong in different places.
     - `iterations`: iterations of `AdmmTV`, at most; 40 are twice as fast and 0.8 dB worse.
     - `widths`: channels of the levels of the `UNet`, from the finest.
     - `colours`: colours that the network sees together: 1 or as many as the captures have.
@@ -81,7 +82,7 @@ class TrainedOptions:
     iterations: Annotated[int, whole(1, 1000)] = 100
     widths: Annotated[tuple[int, ...], whole(1, 512, many=True)] = (32, 48, 64, 96)
     colours: Annotated[int, whole(1, 16)] = 1
-    method: Annotated[str, choice(("admm_tv", "pnp"))] = "admm_tv"
+    method: Annotated[str, choice(tuple(_IMAGES))] = "admm_tv"
 
     def __post_init__(self):
         check_fields(self)
@@ -90,7 +91,9 @@ class TrainedOptions:
 
 
 class PhysicsStep(eqx.Module):
-    """`AdmmTV` or `PlugAndPlay` and the Wiener filter of what it leaves; see the module's equation.
+    """`AdmmTV`, `PlugAndPlay` or both, and the Wiener filter of what the last one leaves.
+
+    See the module's equation.
 
     - `noise`: ln λ of each colour, or one for all.
     """
@@ -99,13 +102,16 @@ class PhysicsStep(eqx.Module):
     iterations: int = eqx.field(static=True)
     method: str = eqx.field(static=True, default="admm_tv")
 
-    def __call__(self, recording: Recording) -> tuple[InverseProblem, Image]:
-        """The problem of the whole field that sends light to the sensor, and the image of it."""
+    def __call__(self, recording: Recording) -> tuple[InverseProblem, tuple[Image, ...]]:
+        """The problem of the whole field that sends light to the sensor, and its images."""
         whole_field = with_whole_field(recording)
-        problem = whole_field.problem()
-        solver = PlugAndPlay() if self.method == "pnp" else AdmmTV(iterations=self.iterations)
-        found = solver.solve(pinned(whole_field))
-        return problem, jnp.asarray(found.image).reshape(problem.image_shape)
+        problem, solvers = whole_field.problem(), []
+        if self.method != "pnp":
+            solvers.append(AdmmTV(iterations=self.iterations))
+        if self.method != "admm_tv":
+            solvers.append(PlugAndPlay())
+        found = (solver.solve(pinned(whole_field)).image for solver in solvers)
+        return problem, tuple(jnp.asarray(one).reshape(problem.image_shape) for one in found)
 
 
 def with_whole_field(recording: Recording) -> Recording:
@@ -148,12 +154,12 @@ def refined(
 
 @eqx.filter_jit
 def prepared(
-    physics: PhysicsStep, problem: InverseProblem, image: Image
-) -> tuple[Float[Array, "2 *batch channel v u"], Float[Array, "*batch 1 1 1"]]:
-    """Both images in front of the sensor, in their unit, the network's white; and that unit."""
-    sensor = _seen(problem)
-    both = refined(problem, image, physics.noise), image[..., 0, :, :]
-    inside = jnp.stack([centred_crop(one, sensor) for one in both])
+    physics: PhysicsStep, problem: InverseProblem, images: tuple[Image, ...]
+) -> tuple[Float[Array, "input *batch channel v u"], Float[Array, "*batch 1 1 1"]]:
+    """All images in front of the sensor, in their unit, the network's white; and that unit."""
+    sensor, filtered = _seen(problem), refined(problem, images[-1], physics.noise)
+    seen = filtered, *(image[..., 0, :, :] for image in images)
+    inside = jnp.stack([centred_crop(one, sensor) for one in seen])
     flat = jax.lax.stop_gradient(inside[-1]).reshape(*inside.shape[1:-3], -1)
     unit = or_one(jnp.maximum(jnp.percentile(flat, _WHITE, axis=-1), 0))[..., None, None, None]
     return inside / unit, unit
@@ -178,12 +184,12 @@ def cleaned(
 
 
 def completed(
-    physics: PhysicsStep, network: UNet, problem: InverseProblem, image: Image
+    physics: PhysicsStep, network: UNet, problem: InverseProblem, images: tuple[Image, ...]
 ) -> Float[Array, "*batch channel y x"]:
-    """The image of the whole field, cleaned in front of the sensor; differentiable."""
-    images, unit = prepared(physics, problem, image)
-    colours = network.leave.weight.shape[0] // 4
-    inside = jnp.maximum(cleaned(network, colours, images), 0) * unit
+    """The last image of the whole field, cleaned in front of the sensor; differentiable."""
+    inputs, unit = prepared(physics, problem, images)
+    colours, image = network.leave.weight.shape[0] // 4, images[-1]
+    inside = jnp.maximum(cleaned(network, colours, inputs), 0) * unit
     sizes = zip(image.shape[-2:], inside.shape[-2:], strict=True)
     corner = (*(0,) * (inside.ndim - 2), *((f - n) // 2 for f, n in sizes))
     return jax.lax.dynamic_update_slice(image[..., 0, :, :], inside, corner)
@@ -270,7 +276,9 @@ class TrainedReconstruction(AbstractSolver):
         """An untrained one for the camera of a PSF, whose network adds nothing."""
         colours = psf.shape[0] if psf.ndim > 2 else 1
         noise, together = jnp.full(colours, np.log(0.1), jnp.float32), options.colours
-        network = UNet(_IMAGES * together, together, options.widths, key=random_key(key))
+        network = UNet(
+            _IMAGES[options.method] * together, together, options.widths, key=random_key(key)
+        )
         physics = PhysicsStep(noise, options.iterations, options.method)
         return cls(physics, network, CameraPortrait.of(psf))
 
@@ -284,8 +292,8 @@ class TrainedReconstruction(AbstractSolver):
 
     def solve(self, recording: Recording) -> Reconstruction:
         began, doubt = time.perf_counter(), self._checked(recording)
-        problem, first = self.physics(recording)
-        image = jax.block_until_ready(_completed(self.physics, self.network, problem, first))
+        problem, images = self.physics(recording)
+        image = jax.block_until_ready(_completed(self.physics, self.network, problem, images))
         field = getattr(recording.imaging_model, "field_shape", None)
         if field is not None:
             sides = zip(field, image.shape[-2:], strict=True)
@@ -370,7 +378,7 @@ def _like(options: dict[str, Any], camera: dict[str, Any]) -> TrainedReconstruct
     sizes = {name: options[name] for name in names if name in options}
     made = TrainedOptions(**sizes, widths=tuple(options["widths"]))
     network = eqx.filter_eval_shape(
-        lambda key: UNet(_IMAGES * made.colours, made.colours, made.widths, key=key),
+        lambda key: UNet(_IMAGES[made.method] * made.colours, made.colours, made.widths, key=key),
         jax.random.key(0),
     )
     portrait = None

@@ -93,9 +93,9 @@ class ReconstructionLessons:
         drawn = [self.camera.drawn(_seed(seed, _FITTING), n) for n in range(self.fitted)]
         errors = np.zeros((len(_NOISES), len(self.camera.psf)))
         for recording, scene in drawn:
-            problem, image = physics(recording)
+            problem, images = physics(recording)
             truth = jnp.asarray(scene)
-            errors += [np.asarray(_error(problem, image, one, truth)) for one in _NOISES]
+            errors += [np.asarray(_error(problem, images[-1], one, truth)) for one in _NOISES]
         noise = jnp.asarray(_NOISES[errors.argmin(axis=0)], jnp.float32)
         return dataclasses.replace(physics, noise=noise)
 
