@@ -1,6 +1,6 @@
 """Video rate: from frames of a camera to images of 8 bits, and what a moving scene costs.
 
-A thread triggers the virtual USB3 Vision camera 60 times a second, 12 bits, a scene that moves by
+A thread triggers a virtual camera 60 times a second, 12 bits, a scene that moves by
 four pixels a frame before a zone aperture. A loop takes the newest frame, or the last four of
 four phases, and makes an image; frames that come meanwhile are dropped. Compilation and the first
 images are apart. Parts are timed alone, and transforms are the floor of all. Besides seconds the
@@ -23,8 +23,7 @@ import skimage.data
 import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax.hardware import CameraSettings
-from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
-from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
+from thincam_jax.hardware.virtual.devices import VirtualCamera
 from thincam_jax.units import nm, um
 
 RATE, SECONDS, WARM_UP, FULL = 60.0, 6.0, 3, 4095
@@ -73,10 +72,9 @@ def loop(supply, depth, image_of):
     """Print images a second, latency and dropped frames; returns the last picture."""
     ready, stop, newest, times = threading.Condition(), threading.Event(), deque(maxlen=depth), []
     given = cycle(supply)
-    device = VirtualUsb3Vision(lambda _: next(given), supply.shape[1:])
 
     def expose():
-        with Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device)) as camera:
+        with VirtualCamera(lambda _: next(given), supply.shape[1:]) as camera:
             camera.configure(CameraSettings(1e-3, pixel_format="Mono12"))
             began, number = time.perf_counter(), 0
             while not stop.is_set():

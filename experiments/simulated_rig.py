@@ -3,9 +3,8 @@
 
 A light modulator shows zone apertures, a camera behind it takes a frame of each, and an image is
 made of the frames (method B of the thesis, section 3.4). Without a `virtual` rig below, the same
-drivers open real devices, and the rest of this script stays. The virtual devices speak the real
-protocols: the camera USB3 Vision, the stage Zaber's ASCII. `thincam capture` does the same with
-an experiment file.
+drivers open real devices, and the rest of this script stays. The virtual stage speaks Zaber's real
+protocol, the camera is a function. `thincam capture` does the same with an experiment file.
 """
 
 import os
@@ -53,7 +52,7 @@ if os.environ.get("THINCAM_RIG", "virtual") == "virtual":
     optics = ModulatorOptics(scene, sensor, display_pitch, distance, electrons)
     virtual = VirtualRig(optics, electronics, display_shape=(192, 256), response=2e-3)
 drivers = {
-    "camera": ("usb3_vision", {}),
+    "camera": ("aravis", {}),
     "display": ("sdl", {}),
     "stage": ("zaber", {"port": "/dev/ttyUSB0"}),
 }

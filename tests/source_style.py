@@ -106,7 +106,6 @@ MANY_PARAMETERS = {
     "commands/reconstruct/command.py": ("reconstruct", "check"),  # the options of the command
     "commands/evaluate/command.py": ("evaluate",),
     "commands/sweep/command.py": ("sweep",),
-    "hardware/virtual/usb3_vision.py": ("ctrl_transfer",),  # a backend of pyusb
     "reconstruction/admm.py": ("init", "postprocess"),  # a solver of optimistix
     "reconstruction/proximal_gradient.py": ("init", "postprocess"),
     # A record; of its sides and `pixel_pitch`, as in files, it holds the number of pixels.

@@ -115,7 +115,7 @@ def test_the_core_runs_without_any_extra(tmp_path):
         "rawpy",
         "serial",
     )
-    extras += ("starlette", "usb", "uvicorn", "zarr", "deepinv", "torch", "scico")
+    extras += ("starlette", "uvicorn", "zarr", "deepinv", "torch", "scico")
     file, tiff = tiny.write(tmp_path), tmp_path / "a.tif"
     tifffile.imwrite(tiff, np.ones((6, 8), np.uint8), compression="lzw")
     modules = imported_by(

@@ -5,46 +5,32 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from commands.test_cli import call, one_line
 
 from thincam_jax.hardware import registry
-from thincam_jax.hardware.base import Busy, CameraSettings, Connected, Device, NotFound
-from thincam_jax.hardware.cameras.usb3_vision.camera import Usb3VisionCamera
+from thincam_jax.hardware.base import Busy, Connected, Device, NotFound
+from thincam_jax.hardware.cameras import aravis
 from thincam_jax.hardware.holder import held, holder
 from thincam_jax.hardware.virtual.grbl import VirtualGrbl
-from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
 from thincam_jax.hardware.virtual.zaber import VirtualZaber
 
 
-class Watched(VirtualUsb3Vision):
-    """Notes what is written to it and claimed of it."""
-
-    def __init__(self):
-        super().__init__(lambda settings: np.zeros((32, 48), np.uint16), (32, 48))
-        self.written = []
-
-    def bulk_write(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
-        self.written.append(args)
-        return super().bulk_write(*args)
-
-    def claim_interface(self, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
-        self.written.append(args)
-        return super().claim_interface(*args)
-
-
-def test_a_camera_is_read_by_its_descriptors_alone():
-    backend = Watched()
-    (found,) = Usb3VisionCamera.connected(backend)
-    assert (found.kind, found.driver) == ("camera", "usb3_vision")
-    assert not backend.written and not backend._open
-    options = Usb3VisionCamera.Options(**found.options, backend=backend)
-    with Usb3VisionCamera.open(options) as camera:
-        assert camera.identity.serial == found.options["serial"]
-        assert camera.identity.vendor in found.about and camera.identity.model in found.about
-        camera.configure(CameraSettings(exposure=0.01))
-        assert Usb3VisionCamera.connected(backend) == [found]  # also while it is in use
+def test_cameras_of_aravis_are_listed_by_their_names(monkeypatch):
+    """By a double of aravis' list, which is looked up anew."""
+    names = ["FLIR-Blackfly S BFS-U3-51S5M-22541873", "Aravis-Fake-1"]
+    listed: list[str] = []
+    double = SimpleNamespace(
+        update_device_list=lambda: listed.extend(names),
+        get_n_devices=lambda: len(listed),
+        get_device_id=lambda n: listed[n],
+        get_device_vendor=lambda n: listed[n].split("-")[0],
+        get_device_model=lambda n: listed[n].split("-")[1],
+    )
+    monkeypatch.setattr(aravis, "_libraries", lambda: (double, None))
+    first, second = aravis.AravisCamera.connected()
+    assert str(first) == f"camera aravis {{name: {names[0]}}}: FLIR Blackfly S BFS"
+    assert aravis.AravisCamera.Options(**second.options).name == names[1]
 
 
 def test_cameras_of_pylon_and_monitors(monkeypatch):

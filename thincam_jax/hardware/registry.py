@@ -24,7 +24,6 @@ from thincam_jax.hardware.base import Connected, Device, HardwareError, NotFound
 
 _BUILT_IN = {
     "cameras": {
-        "usb3_vision": "thincam_jax.hardware.cameras.usb3_vision.camera:Usb3VisionCamera",
         "pylon": "thincam_jax.hardware.cameras.pylon:PylonCamera",
         "aravis": "thincam_jax.hardware.cameras.aravis:AravisCamera",
         "pylablib": "thincam_jax.hardware.cameras.pylablib:PylablibCamera",
@@ -56,6 +55,12 @@ def drivers(kind: str) -> dict[str, str]:
 @checked
 def driver(kind: str, name: str) -> type[Device]:
     """Class of a driver; `NotFound` where it is unknown, broken or its library is missing."""
+    found = _class(kind, name)
+    getattr(found, "require_libraries", lambda: None)()  # those that pip does not install
+    return found
+
+
+def _class(kind: str, name: str) -> type[Device]:
     known = drivers(kind)
     if name not in known:
         raise NotFound(name, "open", f"no driver of that name among the {kind}",
@@ -71,7 +76,6 @@ def driver(kind: str, name: str) -> type[Device]:
     except (Exception, SystemExit) as error:  # whatever code of another package may raise
         cause, remedy = f"broken ({type(error).__name__}: {error})", f"mend or remove {module}"
         raise NotFound(name, "open", cause, remedy) from error
-    getattr(found, "require_libraries", lambda: None)()  # those that pip does not install
     return found
 
 
@@ -94,13 +98,18 @@ def driver_report() -> list[str]:
 @checked
 def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Open a device; `options` are attributes of the driver's `Options`."""
-    chosen, given = driver(kind, name), dict(options or {})
-    allowed = [field.name for field in fields(chosen.Options)]
+    return driver(kind, name).open(read_options(kind, name, options))
+
+
+def read_options(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
+    """`Options` of a driver; ValueError for those that it has not."""
+    made, given = _class(kind, name).Options, dict(options or {})
+    allowed = [field.name for field in fields(made)]
     if unknown := set(given) - set(allowed):
         raise ValueError(
             f"{name} has no option {', '.join(sorted(unknown))}; allowed: {', '.join(allowed)}"
         )
-    return chosen.open(chosen.Options(**given))
+    return made(**given)
 
 
 _PATIENCE = 0.5  # s for an answer

@@ -23,7 +23,7 @@ from thincam_jax.units import deg
 MASK = {"betas": ["60 rad/mm^2"], "width": "1.44 mm"}
 POSE = {"x": "2 mm", "y": "-1.5 mm", "z": "2 mm", "rotation": "3 deg", "turn": "6 deg"}
 ALIGNMENT = yaml.safe_load(tiny.METHOD_B) | {
-    "camera": {"driver": "usb3_vision", "exposure": "500 ms", "pitch": "22 um"},
+    "camera": {"driver": "aravis", "exposure": "500 ms", "pitch": "22 um"},
     "display": {"driver": "sdl", "pitch": "0.5 mm", "settle": "1 ms"},
     "plan": {"kind": "alignment", "marks": [3, 3], "spread": "20 mm", "size": "3 mm"} | MASK,
     "targets": [],

@@ -135,8 +135,8 @@ def test_an_error_of_a_device_is_one_line_and_how_to_go_on(tmp_path):
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
-        ("camera.driver=kodak", "kodak: open: there is no virtual one among the cameras; use usb"),
-        ("camera.options={gray: 1}", "options: usb3_vision has no option gray; allowed: "),
+        ("camera.driver=kodak", "kodak: open: there is no virtual one among the cameras; use ara"),
+        ("camera.options={gray: 1}", "options: aravis has no option gray; allowed: "),
         ("plan.width=1.476 mm", "plan.width: 41 × 41 pixels cannot be centred on 60 × 80"),
     ],
 )

@@ -101,7 +101,7 @@ def test_ctrl_c_frees_the_devices(tmp_path, monkeypatch):
 
     def ctrl_c(shown, *_):
         shown.view()
-        with pytest.raises(Busy), held("usb3_vision {serial: 7}"):
+        with pytest.raises(Busy), held("aravis {serial: 7}"):
             pass
         raise KeyboardInterrupt
 
@@ -109,12 +109,12 @@ def test_ctrl_c_frees_the_devices(tmp_path, monkeypatch):
     monkeypatch.setattr("thincam_jax.hardware.commands.command.serve_page", ctrl_c)
     raw = {"name": "real", "kind": "capture", "rig": "real", "plan": {"kind": "scene"}}
     raw["camera"] = {
-        "driver": "usb3_vision", "options": {"serial": 7}, "exposure": "10 ms", "pitch": "5 um"
+        "driver": "aravis", "options": {"serial": 7}, "exposure": "10 ms", "pitch": "5 um"
     }  # fmt: skip
     result = call("preview", tiny.write(tmp_path, yaml.safe_dump(raw)))
     assert result.exit_code == 130 and result.stderr == "thincam: interrupted\n"
     assert len(opened) == 2 and not any(device.here for device in opened)
-    with held("usb3_vision {serial: 7}"):
+    with held("aravis {serial: 7}"):
         pass
 
 
@@ -122,7 +122,7 @@ def test_a_second_preview_of_a_camera_is_told_who_has_it(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     file = tiny.write(tmp_path)
     for command in ("preview", "capture"):
-        with held("usb3_vision {serial: 7}"):
+        with held("aravis {serial: 7}"):
             options = ("--set", "rig=real", "--set", "camera.options={serial: 7}")
             result = call(command, file, *options)
         (line,) = result.stderr.splitlines()

@@ -7,7 +7,7 @@ name: tiny-rig
 kind: capture
 seed: 3
 rig: virtual
-camera: {driver: usb3_vision, exposure: 20 ms, pitch: 33 um}
+camera: {driver: aravis, exposure: 20 ms, pitch: 33 um}
 display: {driver: sdl, pitch: 36 um, settle: 2 ms}
 plan:
   kind: method_b
@@ -31,7 +31,7 @@ name: tiny-hadamard
 kind: capture
 seed: 3
 rig: virtual
-camera: {driver: usb3_vision, exposure: 10 ms, pitch: 60 um}
+camera: {driver: aravis, exposure: 10 ms, pitch: 60 um}
 display: {driver: sdl, pitch: 1 mm, settle: 1 ms}
 plan: {kind: hadamard, cells: [8, 16], dark_frames: 2}
 acquisition: {saturated: 0.1}

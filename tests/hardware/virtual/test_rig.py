@@ -10,7 +10,7 @@ import scipy
 import thincam_jax as tc
 from helpers import read_fiducial
 from thincam_jax.hardware import CameraSettings, registry
-from thincam_jax.hardware.base import Region
+from thincam_jax.hardware.base import NotFound, OutOfRange, Region
 from thincam_jax.hardware.displays.levels import PhaseLevels
 from thincam_jax.hardware.virtual.devices import VirtualDevices
 from thincam_jax.hardware.virtual.optics import (
@@ -198,6 +198,35 @@ def test_before_the_display_has_answered_the_pattern_before_is_seen(monkeypatch)
     assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(white)
 
 
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (
+            CameraSettings(0.01, Region(0, 0, 21, 30)),
+            "outside of the sensor; give a part of 20 × 30",
+        ),
+        (CameraSettings(11.0), "ExposureTime of 11 s; give 1e-05 … 10 s"),
+        (CameraSettings(0.01, pixel_format="RGB8"), "RGB8; give one of Mono8, Mono10"),
+        (CameraSettings(0.01, None, "BayerRG8", binning=2), "binning mixes the colours"),
+        (CameraSettings(0.01, black_level=3.0), "give the offset of the virtual rig"),
+        (CameraSettings(0.01, trigger="Line1"), "no trigger source Line1; give one of Software, L"),
+    ],
+)
+def test_what_the_virtual_camera_lacks_is_refused(settings, told):
+    with VirtualDevices(rig()) as devices, devices.camera("aravis") as camera:
+        with pytest.raises(OutOfRange, match=told):
+            camera.configure(settings)
+        assert camera.trigger_and_grab(1.0).pixels.shape == (20, 30)
+
+
+def test_drivers_that_have_no_virtual_camera_and_their_options():
+    with VirtualDevices(rig()) as devices:
+        with pytest.raises(NotFound, match="use aravis or pylon"):
+            devices.camera("picamera2")
+        with pytest.raises(ValueError, match="aravis has no option gray; allowed: name"):
+            devices.camera("aravis", {"gray": 1})
+
+
 def without_libraries(monkeypatch):
     def not_installed(name):
         raise ImportError(f"No module named {name!r}")
@@ -212,7 +241,7 @@ def test_without_its_library_a_plain_device_gives_the_same_frames(monkeypatch, c
         with VirtualDevices(rig()) as devices:
             if is_missing:
                 without_libraries(monkeypatch)
-            camera, stage = devices.camera("usb3_vision"), devices.stage("zaber")
+            camera, stage = devices.camera("pylon"), devices.stage("zaber")
             stage.home()
             assert stage.move_to(12.5) == stage.position() == pytest.approx(12.5, abs=1e-3)
             settings = dataclasses.replace(SETTINGS, region=Region(0, 4, 16, 24))

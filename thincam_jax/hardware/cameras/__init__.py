@@ -1,1 +1,1 @@
-"""Cameras: USB3 Vision over pyusb, pylon, aravis."""
+"""Cameras: aravis, pylon, pylablib, picamera2."""

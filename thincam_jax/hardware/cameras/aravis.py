@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax.hardware import base
-from thincam_jax.hardware.base import CameraSettings, Frame, HardwareError, Identity
+from thincam_jax.hardware.base import CameraSettings, Connected, Frame, HardwareError, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
     FeatureCamera,
@@ -59,6 +59,20 @@ class AravisCamera(FeatureCamera):
     def require_libraries() -> None:
         """Raise NotFound, with what to install, where libraries are missing."""
         _libraries()
+
+    @classmethod
+    def connected(cls) -> list[Connected]:
+        aravis, _ = _libraries()
+        aravis.update_device_list()
+        return [
+            Connected(
+                "camera",
+                "aravis",
+                {"name": aravis.get_device_id(n)},
+                f"{aravis.get_device_vendor(n)} {aravis.get_device_model(n)}",
+            )
+            for n in range(aravis.get_n_devices())
+        ]
 
     def _introduce(self) -> None:
         device = self._camera.get_device()

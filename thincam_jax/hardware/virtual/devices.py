@@ -1,8 +1,8 @@
 """The devices of a virtual rig, opened by the drivers of real ones.
 
-They use the real protocols: USB3 Vision behind a backend of pyusb in this process, the vendor's
-emulator for pylon, Zaber and GRBL on pseudo-terminals. Only a display has no protocol. Nothing
-listens on a network. Where the library of a driver is missing, a plain device takes its place.
+Stages use the real protocols, of Zaber and GRBL on pseudo-terminals, and a camera of pylon the
+vendor's emulator. Another camera and the display have no protocol. Nothing listens on a network.
+Where the library of a driver is missing, a plain device takes its place.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from importlib.metadata import version
 from typing import Any, Literal, get_args
 
@@ -87,15 +87,21 @@ class Faults:
 TRAVEL = 50.0  # mm, of virtual stages
 
 
-class PlainCamera(Camera):
-    """A camera whose frames come from a function.
+_LEAST, _LONGEST = 1e-5, 10.0  # s, exposures of the virtual camera
+LINE, LINE_PERIOD = "Line0", 0.02  # an external trigger of the virtual camera, s between pulses
+
+
+class VirtualCamera(Camera):
+    """A camera whose frames come from a function, without a protocol.
+
+    It exposes at once, or with the trigger `LINE` at the next pulse of a clock.
 
     - `expose`: returns the counts (y, x) of a frame exposed now, within the settings' region.
     - `shape`: rows and columns of its sensor.
     """
 
     def __init__(self, expose: Callable[[CameraSettings], np.ndarray], shape: tuple[int, int]):
-        self.identity = Identity("thincam_jax", "plain camera", "virtual", version("thincam_jax"))
+        self.identity = Identity("thincam_jax", "virtual camera", "virtual", version("thincam_jax"))
         self._expose, self._shape, self._number = expose, shape, 0
         self._settings = self.configure(CameraSettings(1e-3, pixel_format="Mono8"))
 
@@ -107,11 +113,21 @@ class PlainCamera(Camera):
         rows, columns = (n // settings.binning for n in self._shape)
         region = settings.region or Region(0, 0, rows, columns)
         if region.top + region.height > rows or region.left + region.width > columns:
-            raise self._refused(f"{region} on {rows} × {columns} pixels", "a smaller region")
+            what = f"{region} lies outside of the sensor"
+            raise self._refused(what, f"a part of {rows} × {columns}")
+        if not _LEAST <= settings.exposure <= _LONGEST:
+            what = f"ExposureTime of {settings.exposure:g} s"
+            raise self._refused(what, f"{_LEAST:g} … {_LONGEST:g} s")
         if settings.pixel_format not in BIT_DEPTHS:
             raise self._refused(settings.pixel_format, f"one of {', '.join(BIT_DEPTHS)}")
-        if settings.trigger != SOFTWARE:
-            raise self._refused(f"trigger {settings.trigger}", SOFTWARE)
+        if settings.bayer and settings.binning > 1:
+            what = f"binning mixes the colours of {settings.pixel_format}"
+            raise self._refused(what, "binning 1")
+        if settings.black_level is not None:
+            raise self._refused("it has no black level", "the offset of the virtual rig")
+        if settings.trigger not in (SOFTWARE, LINE):
+            what = f"no trigger source {settings.trigger}"
+            raise self._refused(what, f"one of {SOFTWARE}, {LINE}")
         self._settings = dataclasses.replace(settings, region=region)
         return self._settings
 
@@ -119,9 +135,11 @@ class PlainCamera(Camera):
         pass  # no frame waits
 
     def trigger_and_grab(self, timeout: float) -> Frame:
+        settings = self._settings
+        if settings.trigger == LINE:
+            time.sleep(-time.monotonic() % LINE_PERIOD)
         self._number += 1
-        settings, now = self._settings, time.monotonic()
-        bits = BIT_DEPTHS[settings.pixel_format]
+        now, bits = time.monotonic(), BIT_DEPTHS[settings.pixel_format]
         return Frame(self._expose(settings), self._number, now, settings.exposure, bits)
 
     def close(self) -> None:
@@ -214,24 +232,17 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         self._powered = ExitStack()
 
     def camera(self, driver: str, options: Mapping[str, Any] | None = None) -> Camera:
-        """Open the camera by usb3_vision or pylon; `options` except the camera's address."""
-        if driver not in ("usb3_vision", "pylon"):
-            raise _none_virtual("cameras", driver, "usb3_vision or pylon")
-        shape, faults = self.rig.optics.sensor_shape, self.faults["camera"]
-        if _lacks_library("cameras", driver):
-            return PlainCamera(self.rig.expose, shape)
-        if driver == "pylon":
+        """Open the camera, for pylon in the vendor's emulator; `options` are checked alone."""
+        if driver not in ("aravis", "pylon"):
+            raise _none_virtual("cameras", driver, "aravis or pylon")
+        with suppress(NotFound):  # its library is missing
+            registry.read_options("cameras", driver, options)
+        shape = self.rig.optics.sensor_shape
+        if driver == "pylon" and not _lacks_library("cameras", driver):
             from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
 
-            return VirtualPylonCamera(self.rig.expose, shape, faults)
-        from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
-
-        if "camera" not in self._there:
-            self._there["camera"] = VirtualUsb3Vision(self.rig.expose, shape, faults=faults)
-        backend = self._there["camera"]
-        return registry.open_device(
-            "cameras", driver, {**(options or {}), "serial": "", "backend": backend}
-        )
+            return VirtualPylonCamera(self.rig.expose, shape, self.faults["camera"])
+        return VirtualCamera(self.rig.expose, shape)
 
     def stage(self, driver: str, options: Mapping[str, Any] | None = None) -> Stage:
         """Open the stage by zaber or grbl, `options` except its port; manual asks a person."""
