@@ -87,7 +87,9 @@ def test_without_aravis_the_remedy_is_named(monkeypatch):
 def test_frames_and_settings(fake):
     with fake.start() as camera:
         assert camera.identity.serial == SERIAL and camera.sensor_shape == (2048, 2048)
-        assert {"name": f"Aravis-Fake-{SERIAL}"} in [one.options for one in AravisCamera.connected()]
+        assert {"name": f"Aravis-Fake-{SERIAL}"} in [
+            one.options for one in AravisCamera.connected()
+        ]
         assert camera.configure(SETTINGS) == SETTINGS
         frames = [camera.trigger_and_grab(TIMEOUT) for _ in range(4)]
         shown = [count_shown(frame.pixels) for frame in frames]
