@@ -59,7 +59,7 @@ def test_a_page_fits_and_asks_for_nothing(view, page):
 def test_every_name_of_the_reference_fits_a_phone(view):
     """The column of text is wider on a screen, and the bar that of all pages."""
     names = [page for page in PAGES if NAME in page]
-    assert len(names) > 300
+    assert len(names) > 150  # nearly one for each of the names that docs/api promises
     for page in names:
         fits(view, page, 390)
 

@@ -76,20 +76,17 @@ class TrainingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Learning task.
+    """Learning task; floating arrays of the model are trained.
 
     - `draw`: examples for a step, from its key; the same key gives the same ones.
     - `loss`: (model, examples) → a number and a dictionary of its parts, for `grad`, at module
       level; it is compiled once.
     - `validation`: examples whose mean loss judges the model.
-    - `learned`: part of the model that is trained, a filter of `equinox.filter`; by default
-      floating arrays.
     """
 
     draw: Callable[[Any], Any]
     loss: Callable[[Any, Any], tuple[Any, dict[str, Any]]]
     validation: Sequence[Any] = ()
-    learned: Any = eqx.is_inexact_array
 
 
 class TrainingState(eqx.Module):
@@ -124,11 +121,12 @@ class TrainingState(eqx.Module):
         return {**self.counts, "scores": scores}
 
     @classmethod
-    def begin(cls, model: Any, task: Task, options: TrainingOptions) -> "TrainingState":
+    def begin(cls, model: Any, options: TrainingOptions) -> "TrainingState":
         """State before the first step."""
         # A plain number's weak type would be compiled for once more: steps return none.
         weights = jax.tree.map(
-            lambda x: jax.lax.convert_element_type(x, x.dtype), eqx.filter(model, task.learned)
+            lambda x: jax.lax.convert_element_type(x, x.dtype),
+            eqx.filter(model, eqx.is_inexact_array),
         )
         checked = -(-options.steps // options.check_every)
         losses, scores = (np.full(n, np.nan) for n in (options.steps, checked))
@@ -184,9 +182,9 @@ def train_model(
     A step that gives NaN is skipped. After three in a row training goes back to the last state
     that was kept, at half the rate and with other examples; after four such retreats it ends.
     """
-    fixed = eqx.filter(model, task.learned, inverse=True)
+    fixed = eqx.filter(model, eqx.is_inexact_array, inverse=True)
     key = jax.random.key(options.seed)
-    good = state = TrainingState.begin(model, task, options) if state is None else state
+    good = state = TrainingState.begin(model, options) if state is None else state
     losses, bad, seconds = state.losses.copy(), 0, []
     status: TrainingStatus = "finished"
     while state.step < options.steps:
@@ -242,7 +240,7 @@ class TrainingFiles:
 
     def train(self, task: Task, model: Any, options: TrainingOptions, callback: Any) -> Trained:
         """`train_model`; CheckpointError for a state that is damaged or of another training."""
-        state = TrainingState.begin(model, task, options)
+        state = TrainingState.begin(model, options)
         if self.state.exists():
             state = read_state(self.state, state, self.settings)
         return train_model(task, model, options, state=state, keep=self.keep, callback=callback)

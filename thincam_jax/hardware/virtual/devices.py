@@ -187,33 +187,19 @@ class PlainStage(Stage):
         pass
 
 
-_LATENCY = 0.05  # s
-
-
 class VirtualDisplay(GreyLevelDisplay):
-    """A display that calls `on_show` with the levels (y, x), uint8, of each pattern.
-
-    `faults`: plays latency, a late `show`.
-    """
+    """A display that calls `on_show` with the levels (y, x), uint8, of each pattern."""
 
     identity = Identity("thincam_jax", "virtual display", "virtual", version("thincam_jax"))
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        on_show: Callable[[np.ndarray], None],
-        *,
-        faults: Faults | None = None,
-    ):
+    def __init__(self, shape: tuple[int, int], on_show: Callable[[np.ndarray], None]):
         super().__init__()
-        self.shape, self._on_show, self._faults = shape, on_show, faults or Faults()
+        self.shape, self._on_show = shape, on_show
 
     def close(self) -> None:
         pass
 
     def _present(self, levels: np.ndarray) -> None:
-        if self._faults.due("latency"):
-            time.sleep(_LATENCY)
         self._on_show(levels)
 
 
@@ -221,13 +207,11 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
     """The devices of one `VirtualRig`; a context manager.
 
     `camera`, `stage` and `display` connect, repeatedly, as the openers of an acquisition's rig. A
-    reopened device is the same one: a stage stays homed as long as it has power. `faults` are those
-    of each, by "camera", "stage" and "display".
+    reopened device is the same one: a stage stays homed as long as it has power.
     """
 
     def __init__(self, rig: VirtualRig):
         self.rig = rig
-        self.faults = {role: Faults() for role in ("camera", "stage", "display")}
         self._there: dict[str, Any] = {}
         self._powered = ExitStack()
 
@@ -241,7 +225,7 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         if driver == "pylon" and not _lacks_library("cameras", driver):
             from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
 
-            return VirtualPylonCamera(self.rig.expose, shape, self.faults["camera"])
+            return VirtualPylonCamera(self.rig.expose, shape)
         return VirtualCamera(self.rig.expose, shape)
 
     def stage(self, driver: str, options: Mapping[str, Any] | None = None) -> Stage:
@@ -258,15 +242,14 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
             from thincam_jax.hardware.virtual.zaber import VirtualZaber
 
             kind = VirtualZaber if driver == "zaber" else VirtualGrbl
-            device = kind(faults=self.faults["stage"], on_move=self.rig.on_move)
+            device = kind(on_move=self.rig.on_move)
             self._there["stage"] = self._powered.enter_context(device)
         port = str(self._there["stage"].port)
         return registry.open_device("stages", driver, {**(options or {}), "port": port})
 
     def display(self, driver: str = "", options: Mapping[str, Any] | None = None) -> Display:
         """Open the display, whose patterns go to the rig, whatever the driver and its options."""
-        shape, faults = self.rig.display_shape, self.faults["display"]
-        return VirtualDisplay(shape, self.rig.on_show, faults=faults)
+        return VirtualDisplay(self.rig.display_shape, self.rig.on_show)
 
     def close(self) -> None:
         """Switch off the devices."""
