@@ -30,7 +30,7 @@ def test_an_unknown_kind_is_told(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("name: a\nkind: masks\n")
     told = (
-        "'masks' is unknown; write 'kind: refocus' or 'kind: screen', or leave it out for a study"
+        "'masks' is unknown; write refocus, screen, design, capture, denoiser or trained, or leave"
     )
     with pytest.raises(ConfigError, match=told):
         load_experiment(path)

@@ -136,7 +136,7 @@ def read_kind(path: str | Path) -> Kind:
         return named[given]
     if isinstance(given, str) and given in _ALL and given != "study":
         raise ConfigError(f"{path}: kind: {given} {_needs(_ALL[given].room)}")
-    *others, last = (f"'kind: {name}'" for name, kind in named.items() if kind.command == "run")
+    *others, last = named
     raise ConfigError(
         f"{path}: kind: {given!r} is unknown; write {', '.join(others)} or {last}, or leave it out "
         "for a study"
