@@ -37,21 +37,10 @@ def test_a_free_number_belongs_to_all_phases_of_its_shots(tmp_path, entry, captu
     assert [(v.lower, v.upper) for v in space.variables] == [(lower, upper)] * len(captures)
 
 
-@pytest.mark.parametrize(
-    ("entry", "part"),
-    [
-        ("bounds: [0.5, 1.5]", "leave one that takes the rest, or free none"),
-        (
-            "bounds: [0.5, 2], shots: [1]",
-            "up to 4 shares conflict with the 4 that all captures have",
-        ),
-    ],
-)
-def test_exposures_that_leave_nothing(tmp_path, entry, part):
+def test_exposures_that_leave_nothing(tmp_path):
     noise = "noise={read_noise: 4, electrons: 900}"
-    line = fault(tmp_path, f"search.free=[{{variable: exposure, {entry}}}]", noise)
-    assert ": search.free: " in line
-    assert part in line
+    line = fault(tmp_path, "search.free=[{variable: exposure, bounds: [0.5, 1.5]}]", noise)
+    assert ": search.free: " in line and "leave one that takes the rest, or free none" in line
     unknown = "search.free=[{variable: exposure, bounds: [0.2, 1.2], shots: [1, 3]}]"
     assert "the design has captures 1 to 4" in fault(tmp_path, unknown, noise)
 

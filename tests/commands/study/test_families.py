@@ -129,21 +129,9 @@ def test_refused_in_one_line(tmp_path, mask, method, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("mask", "message"),
-    [
-        ("{family: file, path: no.png, width: 1 mm}", "'no.png' does not exist; give the path"),
-        (
-            "{family: random, width: 1 mm, cell: 2 mm}",
-            "width = 1 mm is not a whole number of cells",
-        ),
-        (
-            MURA[:-1] + ", pixel_pitch: 50 um}",
-            "height = 1.56 mm is not a whole number of cells of pixel_pitch = 0.05 mm; give height",
-        ),
-    ],
-)
-def test_masks_that_cannot_be_built(tmp_path, mask, message):
-    with pytest.raises(ConfigError, match=f"^mask, sensor or model: {message}") as error:
+def test_masks_that_cannot_be_built(tmp_path):
+    mask = "{family: file, path: no.png, width: 1 mm}"
+    message = "^mask, sensor or model: 'no.png' does not exist; give the path"
+    with pytest.raises(ConfigError, match=message) as error:
         build_study(load_experiment(written(tmp_path, mask)))
     assert "\n" not in str(error.value)

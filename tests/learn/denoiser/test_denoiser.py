@@ -105,10 +105,6 @@ def test_a_file_of_no_use_is_told(network, tmp_path):
     Denoiser(spoilt).save(file)
     with pytest.raises(CheckpointError, match="weights that are not finite; give an earlier file"):
         Denoiser.load(file)
-    Denoiser(network).save(file)
-    file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match="is damaged or cut off"):
-        Denoiser.load(file)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Training of a denoiser: its pictures and crops, and how it is gone on with after a kill."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,6 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import LEAST, MOST, Denoiser, DenoiserOptions, create
 from thincam_jax.learn.denoiser.pictures import TILE, drawn, photographs, split
 from thincam_jax.learn.denoiser.reconstructions import draw_crops, loss
@@ -86,7 +83,3 @@ def test_an_interrupted_training_ends_with_the_same_numbers(whole, tmp_path):
     assert eqx.tree_equal(resumed.state, whole.state)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), whole.model)
     assert eqx.tree_equal(Denoiser.load(tmp_path / NETWORK).network, single)
-    # The state is of this training alone.
-    other = dataclasses.replace(OPTIONS, rate=1e-3)
-    with pytest.raises(CheckpointError, match=r"training\.rate was 0\.02 and is 0\.001 here"):
-        train_denoiser(untrained(), LESSONS, other, folder=tmp_path)
