@@ -23,6 +23,8 @@ from thincam_jax.hardware.cameras.features import (
 )
 
 _BUFFERS = 4
+# Devices with a control interface of USB3 Vision, for the user at the machine.
+_RULE = 'SUBSYSTEM=="usb", ENV{ID_USB_INTERFACES}=="*:ef0500:*", TAG+="uaccess"'
 
 
 class AravisCamera(FeatureCamera):
@@ -193,7 +195,7 @@ class AravisCamera(FeatureCamera):
         if code in (codes.NOT_CONTROLLER, codes.PROTOCOL_ERROR_ACCESS_DENIED) or "BUSY" in cause:
             return base.Busy(self._name, operation, cause, "close the program that holds it")
         if "ACCESS" in cause:  # libusb's name for it
-            remedy = "install aravis's udev rule (aravis.rules) and connect the camera again"
+            remedy = f"write {_RULE} to /etc/udev/rules.d/70-usb3-vision.rules and plug it in again"
             return base.PermissionDenied(self._name, operation, cause, remedy)
         silent = codes.TIMEOUT, codes.NOT_CONNECTED, codes.TRANSFER_ERROR, codes.NO_STREAM_CHANNEL
         if code in silent:
@@ -213,8 +215,8 @@ def _libraries() -> tuple[Any, Any]:
             return import_module("gi.repository.Aravis"), import_module("gi.repository.GLib")
     except (ImportError, ValueError) as error:
         remedy = (
-            "apt-get install gir1.2-aravis-0.8 python3-gi, and in a virtual environment "
-            "pip install 'PyGObject<3.51'"
+            "apt-get install gir1.2-aravis-0.8 python3-gi, and a venv of the system's Python with "
+            "--system-site-packages"
         )
         raise base.NotFound(
             "aravis", "open", f"its library is missing ({error})", remedy
