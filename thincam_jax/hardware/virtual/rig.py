@@ -55,7 +55,7 @@ class Electronics:
 
 
 def bits_of(settings: CameraSettings) -> int:
-    """Bits of a pixel format such as Mono12 or Mono12p."""
+    """Bits of a pixel format such as Mono12."""
     return int("".join(c for c in settings.pixel_format if c.isdigit()))
 
 
