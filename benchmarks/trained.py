@@ -2,11 +2,15 @@
 
 `python benchmarks/trained.py NETWORK PSF PHOTOGRAPHS [--capture RAW] [--downsample 8] [--out DIR]`:
 captures of the photographs behind the camera of a PSF, each with its own faults, which no method
-knows; gain and offset of every image are fitted. Prints a table, and draws worst, median and best
-image by the gain of the network, and a real capture, into DIR.
+knows; gain and offset of every image are fitted. NETWORK is a file, or "diffusercam". Prints a
+table, and draws worst, median and best image by the gain of the network, and a real capture, into
+DIR.
 
 `python benchmarks/trained.py FOLDER PSF PHOTOGRAPHS --without-each --downsample 24 --count 60`:
 small networks learn from the photographs of FOLDER, with all faults and without each in turn.
+
+`python benchmarks/trained.py NETWORK PSF PHOTOGRAPHS --bounds`: what a network could gain from
+these images at most: by the best filter for each capture, or by the true PSF.
 
 `python benchmarks/trained.py --scores DIR`: the worst, median and best image of `thincam evaluate`.
 """
@@ -17,14 +21,24 @@ import logging
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy import stats
 
 import thincam_jax as tc
 from thincam_jax import measured
+from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.learn.denoiser.pictures import united
-from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction, cleaned
+from thincam_jax.learn.imperfections import Imperfections
+from thincam_jax.learn.trained import (
+    PhysicsStep,
+    TrainedOptions,
+    TrainedReconstruction,
+    cleaned,
+    with_whole_field,
+)
 from thincam_jax.learn.trained_lessons import CameraLessons, drawn, photographs
 from thincam_jax.learn.trained_training import ReconstructionLessons, train_reconstruction
 from thincam_jax.learn.training import TrainingOptions
@@ -32,6 +46,8 @@ from thincam_jax.studies.agreement import agreement
 from thincam_jax.studies.prepared import pixel_noise, prepared_recording
 
 SEED, WARM = 4242, 100
+WHOLE, LESS = "pnp, whole field", "AdmmTV(tau=0.5)"
+HIDDEN = LESS, "pnp"  # in the pictures
 
 
 def draw(rows, path):
@@ -64,12 +80,18 @@ def draw_scores(folder, path):
     figure.savefig(path, dpi=75)
 
 
+def image_of(recording, name, method, sensor):
+    """The image in front of the sensor; of all that sends light to it where the name says so."""
+    recording = with_whole_field(recording) if name == WHOLE else recording
+    return np.asarray(centred_crop(tc.reconstruct(recording, method).image, sensor), np.float32)
+
+
 def compare(camera, methods, count):
     """Rows of scores by method, (PSNR, SSIM, CPU seconds), and the images."""
     scores, shown = {name: [] for name in methods}, []
     rows, columns = camera.sensor
-    for method in methods.values():
-        tc.reconstruct(camera.drawn(SEED, WARM)[0], method)
+    for name, method in methods.items():
+        image_of(camera.drawn(SEED, WARM)[0], name, method, camera.sensor)
     for number in range(count):
         recording, scene = camera.drawn(SEED, number)
         top, left = ((n - m) // 2 for n, m in zip(scene.shape[1:], camera.sensor, strict=True))
@@ -77,13 +99,69 @@ def compare(camera, methods, count):
         images = {"truth": truth[0], "capture": np.asarray(recording.captures[0])[0]}
         for name, method in methods.items():
             began = time.process_time()
-            image = np.asarray(tc.reconstruct(recording, method).image, np.float32)
+            image = image_of(recording, name, method, camera.sensor)
             seconds = time.process_time() - began
             found = agreement(image, truth)
             scores[name].append((found.psnr_db, found.ssim, seconds))
-            images[f"{name}\n{found.psnr_db:.1f} dB"] = found.image[0]
+            if name not in HIDDEN:
+                images[f"{name}\n{found.psnr_db:.1f} dB"] = found.image[0]
         shown.append(images)
     return scores, shown
+
+
+class Remembered(Imperfections):
+    """Faults whose last PSF is kept in `true`."""
+
+    true: ClassVar[list] = []
+
+    def psf(self, psf, rng):
+        self.true[:] = [super().psf(psf, rng)]
+        return self.true[0]
+
+
+def best_filter(images, truth, reach):
+    """The truth's best linear estimate by pixels of the images nearby: fitted to this truth."""
+    size, (rows, columns) = 2 * reach + 1, truth.shape
+    padded = [np.pad(one, reach, mode="edge").astype(float) for one in images]
+    near = [
+        one[y : y + rows, x : x + columns].ravel()
+        for one in padded
+        for y in range(size)
+        for x in range(size)
+    ]
+    known = np.stack([*near, np.ones(truth.size)], axis=1)
+    weights = np.linalg.lstsq(known, truth.ravel().astype(float), rcond=None)[0]
+    return (known @ weights).reshape(truth.shape)
+
+
+def bounds(camera, count):
+    """Gains over the image of plug and play, dB, by what no method knows."""
+    physics = PhysicsStep(np.zeros(len(camera.psf), np.float32), 100, "both")
+    gains = {}
+    for number in range(count):
+        recording, scene = camera.drawn(SEED, number)
+        truth = np.asarray(centred_crop(scene, camera.sensor))[0]
+        true = tc.Recording(recording.captures[0][None], tc.Psfs(Remembered.true[0][None]))
+        (variation, plug), (mended, known) = (
+            [np.asarray(centred_crop(one[0, 0], camera.sensor)) for one in physics(given)[1]]
+            for given in (recording, true)
+        )
+        tried = {
+            "plug and play": plug,
+            "total variation": variation,
+            "mean of both": (plug + variation) / 2,
+            "best filter of 7×7 pixels": best_filter([plug], truth, 3),
+            "best filter of 7×7 pixels of both": best_filter([plug, variation], truth, 3),
+            "plug and play, true PSF": known,
+            "total variation, true PSF": mended,
+        }
+        for name, image in tried.items():
+            score = agreement(np.asarray(image, np.float32)[None], truth[None]).psnr_db
+            gains.setdefault(name, []).append(score)
+    for name, values in gains.items():
+        gain = np.subtract(values, gains["plug and play"])
+        half = stats.t.ppf(0.975, count - 1) * stats.sem(gain)
+        print(f"| {name} | {np.mean(values):.2f} | {gain.mean():+.2f} ± {half:.2f} |")
 
 
 FAULTS = ("scale", "turn", "blur", "background", "ambient", "saturated", "hot", "bits")
@@ -126,6 +204,7 @@ def main():
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--out", type=Path, default=Path("runs/trained"))
     parser.add_argument("--without-each", action="store_true")
+    parser.add_argument("--bounds", action="store_true")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     if given.scores:
@@ -144,39 +223,44 @@ def main():
         learned = united([*photographs(given.network).values(), drawn(0, 20)])
         without_each(camera, replace(camera, pictures=learned), given.count)
         return
+    if given.bounds:
+        bounds(replace(camera, faults=Remembered()), given.count)
+        return
     trained = TrainedReconstruction.load(given.network)
     methods = {
         "ridge": tc.Ridge(),
         "AdmmTV": tc.AdmmTV(),
-        "AdmmTV(iterations=40)": tc.AdmmTV(iterations=40),
+        LESS: tc.AdmmTV(0.5),
         "pnp": tc.PlugAndPlay(),
+        WHOLE: tc.PlugAndPlay(),
         "trained": trained,
-        "trained, after all iterations": replace(
-            trained, physics=replace(trained.physics, iterations=300)
-        ),
     }
     scores, shown = compare(camera, methods, given.count)
     reference = np.asarray([one[0] for one in scores["AdmmTV"]])
-    print("| method | PSNR, dB | gain over AdmmTV, dB | SSIM | CPU s |\n|---|---|---|---|---|")
+    print("| method | PSNR, dB | gain over AdmmTV, dB | least gain | SSIM | CPU s |")
+    print("|---|---|---|---|---|---|")
     for name, values in scores.items():
         decibels, similar, seconds = np.asarray(values, float).T
         gain = decibels - reference
-        half = 2.2 * gain.std(ddof=1) / len(gain) ** 0.5
+        half = stats.t.ppf(0.975, len(gain) - 1) * stats.sem(gain)
         print(
             f"| {name} | {decibels.mean():.2f} | {gain.mean():+.2f} ± {half:.2f} | "
-            f"{similar.mean():.3f} | {np.median(seconds):.1f} |"
+            f"{gain.min():+.2f} | {similar.mean():.3f} | {np.median(seconds):.1f} |"
         )
+    whole_field = np.asarray([one[0] for one in scores[WHOLE]])
+    beside = np.asarray([one[0] for one in scores["trained"]]) - whole_field
+    half = stats.t.ppf(0.975, len(beside) - 1) * stats.sem(beside)
+    print(f"trained less {WHOLE}: {beside.mean():+.2f} ± {half:.2f}, least {beside.min():+.2f}")
     order = np.argsort(np.asarray([one[0] for one in scores["trained"]]) - reference)
     chosen = [shown[order[place]] for place in (0, len(order) // 2, -1)]
     draw(chosen, given.out / "trained-simulated.png")
     if given.capture is not None:
         recording = prepared_recording(ready, pixel_noise(ready))
-        del methods["AdmmTV(iterations=40)"]
         images = {"capture": ready.capture[0]}
         for name, method in methods.items():
-            image = np.asarray(tc.reconstruct(recording, method).image, np.float32)[0]
-            top, left = ((n - m) // 2 for n, m in zip(image.shape, (rows, columns), strict=True))
-            images[name] = np.maximum(image[top : top + rows, left : left + columns], 0)
+            if name not in HIDDEN:  # all have the whole field
+                image = image_of(recording, name, method, camera.sensor)[0]
+                images[name] = np.maximum(image, 0)
         first = {"AdmmTV": images.pop("AdmmTV")}
         draw([first | images], given.out / "trained-hand.png")
 

@@ -322,7 +322,8 @@ CARDS = {
     "three_lines": ("three-lines.png", 815, 34, 252),
     "video": ("video.png", 854, 21, 223),
     "when_it_looks_wrong": ("when-it-looks-wrong.png", 47, 826, 258),
-    "trained_reconstruction": ("trained-simulated.png", 1245, 10, 120),
+    "trained_diffusercam": ("trained-hand.png", 1085, 296, 200),
+    "trained_reconstruction": ("trained-simulated.png", 1460, 495, 180),
     "your_own_mask": ("own-mask.png", 715, 40, 194),
 }
 

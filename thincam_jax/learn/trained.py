@@ -56,6 +56,8 @@ from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.reconstruction.wiener import prior_spectrum
 
 _KIND = "trained reconstruction"
+SHIPPED = "diffusercam"  # camera whose network comes with the package
+_SHIPPED_FILE = Path(__file__).with_name(f"{SHIPPED}.thincam")
 _LARGE = 64  # pixels of the longer side of a camera's portrait
 _SHIFTED = 8  # part of its sides by which another one may be shifted
 # Correlation of the PSF with that of the training, below which it is another camera's, and below
@@ -356,9 +358,13 @@ class TrainedReconstruction(AbstractSolver):
     def load(path: str | os.PathLike[str]) -> "TrainedReconstruction":
         """Read what `thincam train` wrote.
 
+        `path` may be "diffusercam", the one for the camera of DiffuserCam's tutorial, of captures
+        and a PSF prepared with `downsample=8`.
+
         **Errors**: CheckpointError, one line, for a damaged file, one of another kind, and numbers
         that are not finite; OSError for what cannot be read.
         """
+        path = _file_of(path)
         description = network_description(path, _KIND)
         try:
             like = _like(description["options"], description["camera"])
@@ -393,6 +399,12 @@ def _like(options: dict[str, Any], camera: dict[str, Any]) -> TrainedReconstruct
 def training_record(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Record of a file's training: its data with their licences, its faults, its scores.
 
+    `path` may be "diffusercam".
+
     **Errors**: as of `TrainedReconstruction.load`.
     """
-    return network_description(path, _KIND)["training"]
+    return network_description(_file_of(path), _KIND)["training"]
+
+
+def _file_of(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
+    return _SHIPPED_FILE if str(path) == SHIPPED else path

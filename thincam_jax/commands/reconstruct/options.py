@@ -26,6 +26,7 @@ from thincam_jax.units import parse_quantity
 
 PSF_METHODS = tuple(name.replace("-", "_") for name in METHODS)
 _TRAINED = ".thincam"  # suffix of the files of 'thincam train'
+_SHIPPED = Path(__file__).parents[2] / "learn"  # networks that come with the package
 DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 
 # Far beyond any use; its product with the captures' units stays within float32.
@@ -82,7 +83,12 @@ def is_trained(method: str) -> bool:
 
 
 def read_method(text: str) -> str:
-    """Method by its word in the shell, or the whole path of a trained reconstruction."""
+    """Method by its word in the shell, or the whole path of a trained reconstruction.
+
+    That of a shipped one, such as "diffusercam", has the camera's name.
+    """
+    if not Path(text).suffix and (shipped := _SHIPPED / f"{Path(text).name}{_TRAINED}").is_file():
+        return str(shipped)
     return str(Path(text).resolve()) if is_trained(text) else text.replace("-", "_")
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.reconstruct.jobs import Inputs, Job, write_job
-from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources, is_trained
+from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources, is_trained, read_as
 from thincam_jax.commands.terminal import (
     INTERRUPTED,
     WRONG_INPUT,
@@ -213,9 +214,10 @@ def _reconstruct(
     """The image, unturned; its record is of the method alone."""
     solver = recipe.solver(len(ready.capture))
     # Conjugate gradients are one compiled program, without progress.
-    in_one_piece = recipe.is_ridge or is_trained(recipe.method)
-    callback = None if report is None or in_one_piece else partial(report, job.name)
-    done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
+    trained = is_trained(recipe.method)
+    callback = partial(report, job.name) if report and not (recipe.is_ridge or trained) else None
+    with read_as("--method") if trained else nullcontext():  # of another camera
+        done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
     found = done.found
     if found.status == "non_finite" and recipe.method == "pnp":
         raise measured.MeasurementError(
