@@ -26,6 +26,7 @@ from thincam_jax.reconstruction.problem import (
     scene_level,
     total_misfit,
     uniform_level,
+    with_background,
 )
 from thincam_jax.reconstruction.ridge import solve_ridge
 from thincam_jax.reconstruction.splittings import splitting_of
@@ -393,6 +394,17 @@ def test_no_background_is_above_the_darkest_part_of_its_capture():
     parts = [(np.where(valid, c, 1e30)[None], 1.0 * valid) for c in captures]
     highest = np.array([darkest([jnp.asarray(c)], [jnp.asarray(w)]) for c, w in parts])
     assert highest.min() > 0.5 and highest.max() < 0.56
+
+
+@pytest.mark.parametrize(
+    ("kind", "light", "level"),
+    [("unknown", 2.0, 0.5), ("unknown", 0.2, 0.2), ("unknown", -1.0, -1.0)]
+    + [("nonnegative", 2.0, 0.5), ("nonnegative", -1.0, 0.0), ("known", 2.0, 0.0)],
+)
+def test_a_background_has_an_upper_limit(kind, light, level):
+    difference = jnp.asarray([[-1.0, 1.0], [0.0, 0.0]]) - light  # A f − g: uniform light is missing
+    found = with_background(kind, jnp.ones(()), difference, 2, highest=0.5)
+    np.testing.assert_allclose(found, difference + level, atol=1e-6)
 
 
 @pytest.mark.thorough

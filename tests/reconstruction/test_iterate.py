@@ -175,6 +175,13 @@ def test_it_ends_where_the_objective_stays_above(path, iterations):
     assert outcome.iterations == iterations and outcome.status == "iterations_exhausted"
 
 
+def test_an_image_that_is_still_has_converged_though_its_objective_rose():
+    method, first = Walk(jnp.asarray([0.0, 90, 90.2, 80])), jnp.full((1, 1, 1, 1), 100.0)
+    schedule = Schedule(3, 0.0, check_every=1, rising=0.001, still=0.01)
+    outcome = iterate(method, first, schedule)
+    assert outcome.iterations == 2 and outcome.status == "converged"
+
+
 def test_a_batch_is_judged_by_its_sum():
     class Batch(Walk):
         def image(self, state):

@@ -189,8 +189,9 @@ class Schedule:
       over the last two intervals between checks.
     - `still`: or if the image changed by less than this share of it over the last interval, and the
       objective by less than half of that.
-    - `rising`: a run ends, not converged, if from its second check on the objective is above the
-      lowest one by more than this share, and has not fallen by as much since the last check.
+    - `rising`: a run that is not still ends, not converged, if from its second check on the
+      objective is above the lowest one by more than this share, and has not fallen by as much since
+      the last check.
     - `judged`: whether residuals are looked at after `adapt_until` as well.
     """
 
@@ -250,7 +251,8 @@ def iterate(
             is_stopped = callback is not None and callback(progress)
             still = schedule.still > 0 and _is_still(history, last, current, schedule.still)
             last = current
-            if schedule.rising > 0 and not is_stopped and _is_rising(history, schedule.rising):
+            is_rising = schedule.rising > 0 and _is_rising(history, schedule.rising)
+            if is_rising and not (still or is_stopped):
                 break
             if small or still or _settled(history, schedule.settled):
                 status = "converged"

@@ -155,8 +155,8 @@ class IterativeNormal(AbstractNormal):
             nearest = functools.partial(_filtered, self.inverse_filter())
             if self.uniform is None:
                 return nearest
-            found = self.uniform
-            return lambda image: nearest(image) + found.solved(image, self.shift)
+            beside = self.uniform.solver(self.shift)
+            return lambda image: nearest(image) + beside(image)
         return self.modes and functools.partial(by_modes, self.modes, self.shift)
 
     def least_squares(
@@ -231,10 +231,10 @@ class UniformLight(eqx.Module):
     image: Float[Array, "*batch channel 1 y x"]
     power: Float[Array, "*batch channel 1 1 1"]
 
-    def solved(self, right: Float[Array, "..."], shift: Float[Array, ""]) -> Float[Array, "..."]:
-        """d dᵀb / dᵀ(AᵀwA + μ)d."""
-        size = self.power + shift * inner(self.image, self.image)
-        return self.image * (inner(self.image, right) / or_one(size))
+    def solver(self, shift: Float[Array, ""]):
+        """The function of b that gives d dᵀb / dᵀ(AᵀwA + μ)d."""
+        size = or_one(self.power + shift * inner(self.image, self.image))
+        return lambda right: self.image * (inner(self.image, right) / size)
 
 
 @jax.jit

@@ -197,12 +197,12 @@ def with_background(
 ) -> Float[Array, "..."]:
     """A f + b − g of the difference A f − g, over its last axes.
 
-    - `highest`: upper limit of b, of one that is not negative.
+    - `highest`: upper limit of b.
     """
     if background == "known":
         return difference
-    level = weighted_mean(weight, difference, axes)
-    return difference - (jnp.clip(level, -highest, 0) if background == "nonnegative" else level)
+    level = jnp.maximum(weighted_mean(weight, difference, axes), -highest)
+    return difference - (jnp.minimum(level, 0) if background == "nonnegative" else level)
 
 
 def lit(problem: InverseProblem, image: Image) -> tuple[Bool[Array, "..."], ...]:
@@ -234,6 +234,8 @@ def weighted_mean(
 ) -> Float[Array, "..."]:
     """Mean over the last axes, which keep the length 1; 0 where all weights are."""
     last = tuple(range(-axes, 0))
+    if weight.shape[-axes:] in ((), (1,) * axes):  # uniform: half of the sums
+        return jnp.where(weight > 0, jnp.mean(capture, axis=last, keepdims=True), 0)
     whole = jnp.broadcast_to(weight, jnp.broadcast_shapes(weight.shape, capture.shape))
     total = jnp.sum(whole, axis=last, keepdims=True)
     return jnp.sum(whole * capture, axis=last, keepdims=True) / or_one(total)

@@ -141,7 +141,7 @@ class FourierSplitting(AbstractSplitting):
         self.gains, self.captures, self.weights, self.tau, self.normal, self.image_unit = units
         self.variation, self.nonnegative = variation, problem.nonnegative
         self.background = problem.background
-        is_limited = rough and self.background == "nonnegative"
+        is_limited = rough and self.background != "known"
         self.highest = darkest(self.captures, self.weights) if is_limited else None
         self.penalties = _default_penalties(self.operators, self.gains)
         if near is not None:
