@@ -21,7 +21,7 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 
 import thincam_jax as tc
-from thincam_jax import design
+from thincam_jax import design, measured
 from thincam_jax.design.landscape import evaluate_grid
 from thincam_jax.design.match import ResponseModel, match_response, ring_levels
 from thincam_jax.design.objectives import bayes_error, channels
@@ -32,6 +32,7 @@ from thincam_jax.lensless.masks import (
     random_cells,
 )
 from thincam_jax.reconstruction import phase_pairs
+from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
 from thincam_jax.units import nm, um
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -303,8 +304,37 @@ def photon_transfer():
     return figure
 
 
+def hand():
+    """PSF, capture and image of DiffuserCam's tutorial, whose files `THINCAM_HAND` has."""
+    folder = Path(os.environ.get("THINCAM_HAND", ROOT / "../shared/data/diffusercam-hand"))
+    psf, capture = (
+        measured.read_image(folder / f"{name}_sample.tif") for name in ("psf", "rawdata_hand")
+    )
+    ready = measured.prepare(psf, capture, options=measured.Preparation(downsample=4))
+    found = reconstruct_prepared(ready, tc.AdmmTV(), pixel_noise(ready)).image()[0]
+    light = np.clip(found / np.percentile(found, 99.8), 0, 1) ** (1 / 2.2)
+    figure = Figure(figsize=(9, 2.55), layout="constrained")
+    parts = {"PSF": ready.psf, "capture": ready.capture, "image": light}
+    for ax, (title, part) in zip(figure.subplots(1, 3), parts.items(), strict=True):
+        shown = part if title == "image" else measured.to_display(part)
+        ax.imshow(shown, cmap="gray", vmin=0)
+        ax.set(title=title, xticks=[], yticks=[])
+    return figure
+
+
 _DESIGNS = (design_landscape, design_front, suggest, screen_design)
-_DRAWN = (models, calibration, *_DESIGNS, depth, sweep, masks, which_mask, bench, photon_transfer)
+_DRAWN = (
+    models,
+    calibration,
+    *_DESIGNS,
+    depth,
+    sweep,
+    masks,
+    which_mask,
+    bench,
+    photon_transfer,
+    hand,
+)
 PAGES = {f.__name__: f for f in _DRAWN}
 
 for name in sys.argv[1:] or PAGES:
