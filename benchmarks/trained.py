@@ -86,14 +86,14 @@ def image_of(recording, name, method, sensor):
     return np.asarray(centred_crop(tc.reconstruct(recording, method).image, sensor), np.float32)
 
 
-def compare(camera, methods, count):
+def compare(camera, methods, count, seed):
     """Rows of scores by method, (PSNR, SSIM, CPU seconds), and the images."""
     scores, shown = {name: [] for name in methods}, []
     rows, columns = camera.sensor
     for name, method in methods.items():
-        image_of(camera.drawn(SEED, WARM)[0], name, method, camera.sensor)
+        image_of(camera.drawn(seed, WARM)[0], name, method, camera.sensor)
     for number in range(count):
-        recording, scene = camera.drawn(SEED, number)
+        recording, scene = camera.drawn(seed, number)
         top, left = ((n - m) // 2 for n, m in zip(scene.shape[1:], camera.sensor, strict=True))
         truth = scene[:, top : top + rows, left : left + columns]
         images = {"truth": truth[0], "capture": np.asarray(recording.captures[0])[0]}
@@ -202,6 +202,7 @@ def main():
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--downsample", type=int, default=8)
     parser.add_argument("--count", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--out", type=Path, default=Path("runs/trained"))
     parser.add_argument("--without-each", action="store_true")
     parser.add_argument("--bounds", action="store_true")
@@ -235,7 +236,7 @@ def main():
         WHOLE: tc.PlugAndPlay(),
         "trained": trained,
     }
-    scores, shown = compare(camera, methods, given.count)
+    scores, shown = compare(camera, methods, given.count, given.seed)
     reference = np.asarray([one[0] for one in scores["AdmmTV"]])
     print("| method | PSNR, dB | gain over AdmmTV, dB | least gain | SSIM | CPU s |")
     print("|---|---|---|---|---|---|")
