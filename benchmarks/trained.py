@@ -32,13 +32,7 @@ from thincam_jax import measured
 from thincam_jax.imaging.operators.crop_convolution import centred_crop
 from thincam_jax.learn.denoiser.pictures import united
 from thincam_jax.learn.imperfections import Imperfections
-from thincam_jax.learn.trained import (
-    PhysicsStep,
-    TrainedOptions,
-    TrainedReconstruction,
-    cleaned,
-    with_whole_field,
-)
+from thincam_jax.learn.trained import PhysicsStep, TrainedOptions, TrainedReconstruction, cleaned
 from thincam_jax.learn.trained_lessons import CameraLessons, drawn, photographs
 from thincam_jax.learn.trained_training import ReconstructionLessons, train_reconstruction
 from thincam_jax.learn.training import TrainingOptions
@@ -46,8 +40,8 @@ from thincam_jax.studies.agreement import agreement
 from thincam_jax.studies.prepared import pixel_noise, prepared_recording
 
 SEED, WARM = 4242, 100
-WHOLE, LESS = "pnp, whole field", "AdmmTV(tau=0.5)"
-HIDDEN = LESS, "pnp"  # in the pictures
+LESS = "AdmmTV(tau=0.5)"
+HIDDEN = (LESS,)  # in the pictures
 
 
 def draw(rows, path):
@@ -82,7 +76,6 @@ def draw_scores(folder, path):
 
 def image_of(recording, name, method, sensor):
     """The image in front of the sensor; of all that sends light to it where the name says so."""
-    recording = with_whole_field(recording) if name == WHOLE else recording
     return np.asarray(centred_crop(tc.reconstruct(recording, method).image, sensor), np.float32)
 
 
@@ -233,7 +226,6 @@ def main():
         "AdmmTV": tc.AdmmTV(),
         LESS: tc.AdmmTV(0.5),
         "pnp": tc.PlugAndPlay(),
-        WHOLE: tc.PlugAndPlay(),
         "trained": trained,
     }
     scores, shown = compare(camera, methods, given.count, given.seed)
@@ -248,10 +240,10 @@ def main():
             f"| {name} | {decibels.mean():.2f} | {gain.mean():+.2f} ± {half:.2f} | "
             f"{gain.min():+.2f} | {similar.mean():.3f} | {np.median(seconds):.1f} |"
         )
-    whole_field = np.asarray([one[0] for one in scores[WHOLE]])
-    beside = np.asarray([one[0] for one in scores["trained"]]) - whole_field
+    scored = (np.asarray([one[0] for one in scores[name]]) for name in ("trained", "pnp"))
+    beside = np.subtract(*scored)
     half = stats.t.ppf(0.975, len(beside) - 1) * stats.sem(beside)
-    print(f"trained less {WHOLE}: {beside.mean():+.2f} ± {half:.2f}, least {beside.min():+.2f}")
+    print(f"trained less pnp: {beside.mean():+.2f} ± {half:.2f}, least {beside.min():+.2f}")
     order = np.argsort(np.asarray([one[0] for one in scores["trained"]]) - reference)
     chosen = [shown[order[place]] for place in (0, len(order) // 2, -1)]
     draw(chosen, given.out / "trained-simulated.png")

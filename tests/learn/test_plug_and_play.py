@@ -225,3 +225,20 @@ def test_start_callback_and_status():
     assert result.status == "non_finite" and bool(jnp.isfinite(result.image).all())
     dark = tc.Recording(jnp.zeros(SENSOR), operator(), noise_variance=SIGMA**2)
     assert float(jnp.abs(tc.reconstruct(dark, solver).image).max()) == 0
+
+
+def test_light_beside_the_sensors_view_stays_in_the_image_that_it_begins_with():
+    """Of the default field as of the same field that is given, whose image is not cut."""
+    rng = np.random.default_rng(2)
+    psf, scene = rng.random((1, 9, 11)) ** 4, rng.random((32, 42))
+    A = CropConvolution(jnp.asarray(psf[0]), 1.0, (24, 32), scene.shape)
+    capture = A(jnp.asarray(scene)[None])
+    capture = capture + 1e-2 * jnp.std(capture) * jnp.asarray(rng.normal(size=capture.shape))
+    shown, whole = (
+        tc.reconstruct(
+            tc.Recording(capture, tc.Psfs(psf, field_shape=field), background=0.0),
+            tc.PlugAndPlay(smooth, iterations=2),
+        ).image
+        for field in (None, scene.shape)
+    )
+    np.testing.assert_allclose(shown, whole[4:-4, 5:-5], rtol=1e-5)

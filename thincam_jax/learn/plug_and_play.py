@@ -41,7 +41,7 @@ from thincam_jax.reconstruction.normal_equations import (
     normal_equations,
     padded_field,
 )
-from thincam_jax.reconstruction.outside_light import covering, pinned, reaching_beyond
+from thincam_jax.reconstruction.outside_light import covering, reaching_beyond
 from thincam_jax.reconstruction.parallel import independent_parts
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
@@ -181,7 +181,7 @@ class PlugAndPlay(AbstractIterativeSolver):
         runs: list[_Run] = []
         try:
             if not warm and _is_slow(problem):
-                self._begin_smooth(recording, problem, parts, images, runs)
+                self._begin_smooth(recording, parts, images, runs)
             else:
                 self._begin(parts, images, "near" if warm else "far", runs)
             for number in range(self.iterations + _FURTHER + 1):
@@ -230,7 +230,6 @@ class PlugAndPlay(AbstractIterativeSolver):
     def _begin_smooth(
         self,
         recording: Recording,
-        problem: InverseProblem,
         parts: list[InverseProblem],
         images: list[Image],
         runs: list["_Run"],
@@ -247,10 +246,9 @@ class PlugAndPlay(AbstractIterativeSolver):
             )
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", AccuracyWarning)  # the problem above gave them
-                begun = first.solve(pinned(recording), start=start)
-            start = begun.image
-            image = first_image(problem, recording.oriented(start), uniform=True)
-            images[:] = _split(image, parts)
+                begun = first.whole_field(recording, start)
+            start = recording.oriented(begun.image)
+            images[:] = _split(begun.image, parts)
             self._begin(parts, images, "fitted", runs)
             if begun.status == "interrupted":
                 raise KeyboardInterrupt

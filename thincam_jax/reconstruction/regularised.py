@@ -107,8 +107,27 @@ class AbstractRegularised(AbstractIterativeSolver):
         that scatters, at once, which would otherwise take up to hundreds of iterations; a mostly
         dark field is nearer to zero.
         """
-        rule, reason = (self.tau if isinstance(self.tau, str) else None), ""
         recording = covering(recording, start)
+        problem, outcome, unit = self._iterated(recording, start, callback)
+        result = recording.reconstruction(_over(outcome, unit), self.name, float(problem.tau))
+        result = saying(result, outcome.reason)
+        if not _is_settled(outcome):
+            return result
+        solve = functools.partial(self.solve, start=start, callback=callback)
+        return reaching_beyond(solve, recording, problem, outcome.image, result, self.synthesis)
+
+    def whole_field(
+        self, recording: Recording, start: Float[Array, "..."] | None = None
+    ) -> Outcome:
+        """The outcome with the image of the whole field, not only of the part that is shown."""
+        _, outcome, unit = self._iterated(recording, start, None)
+        return _over(outcome, unit)
+
+    def _iterated(
+        self, recording: Recording, start: Float[Array, "..."] | None, callback: Callback | None
+    ) -> tuple[InverseProblem, Outcome, Image | None]:
+        """The problem, its outcome, and the unit by which planes are divided, if there is one."""
+        rule, reason = (self.tau if isinstance(self.tau, str) else None), ""
         problem = recording.problem(
             tau=DEFAULT_TAU if rule else self.tau,
             regulariser=self.prior,
@@ -131,9 +150,7 @@ class AbstractRegularised(AbstractIterativeSolver):
                 found = find_tau(rule, problem, image)
             except SearchInterrupted as end:
                 seconds = time.perf_counter() - began
-                image = end.image if unit is None else end.image / unit
-                outcome = Outcome(image, "interrupted", (), 0, seconds)
-                return recording.reconstruction(outcome, self.name, float(problem.tau))
+                return problem, Outcome(end.image, "interrupted", (), 0, seconds), unit
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, image, callback, given=start is not None)
@@ -145,17 +162,15 @@ class AbstractRegularised(AbstractIterativeSolver):
                 return shorter.minimise(whole, image, callback, given=True)
 
             outcome = with_smooth_light(whole, outcome, minimise, self.iterations)
-        found, settled = outcome.image, _is_settled(outcome)
-        if unit is not None:
-            outcome = dataclasses.replace(outcome, image=found / unit)
         if rule:
-            outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
-        result = recording.reconstruction(outcome, self.name, float(problem.tau))
-        result = saying(result, reason, outcome.reason)
-        if not settled:
-            return result
-        solve = functools.partial(self.solve, start=start, callback=callback)
-        return reaching_beyond(solve, recording, problem, found, result, self.synthesis)
+            said = "; ".join(one for one in (reason, outcome.reason) if one)
+            seconds = time.perf_counter() - began
+            outcome = dataclasses.replace(outcome, seconds=seconds, reason=said)
+        return problem, outcome, unit
+
+
+def _over(outcome: Outcome, unit: Image | None) -> Outcome:
+    return outcome if unit is None else dataclasses.replace(outcome, image=outcome.image / unit)
 
 
 def _is_settled(outcome: Outcome, least: int = _SETTLED) -> bool:
