@@ -27,6 +27,7 @@ def test_linear_images_come_back_bit_for_bit(tmp_path, suffix, channels):
     assert [p.name for p in tmp_path.iterdir()] == [f"a{suffix}"]
 
 
+@pytest.mark.filterwarnings("ignore::thincam_jax.measured.read.NonlinearWarning")
 @pytest.mark.parametrize("channels", [1, 3])
 def test_png_is_what_is_displayed(tmp_path, channels):
     path = write_image(tmp_path / "a.png", IMAGE[:channels], gamma=1.5, percentile=90)

@@ -78,7 +78,8 @@ def stuck(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray
     """Map of pixels at a lowest value that none comes near, and of lines and blocks of one value.
 
     A sensor's black level lies above 0 by more than its noise: blocks and padding at 0 do not. Up
-    to `_WIDE` lines that are the lowest or highest value throughout, beside others that are not.
+    to `_WIDE` lines that are one value throughout, beside others that are not: the lowest or
+    highest, or any where a background was subtracted and no more lines are.
     Up to `_BLOCKS` blocks of the lowest or highest value, without the blur of light around them.
 
     - `step`: step between values, 1 for counts.
@@ -92,11 +93,13 @@ def stuck(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray
     if 1 < plane.size - others.size < _MOST * plane.size and darkest.min() - low > floor:
         found |= plane == low
     for lines, marked in ((plane, found), (plane.T, found.T)):
-        for value in (low, high):
+        flat = np.flatnonzero(np.ptp(lines, axis=1) == 0)
+        few = lines[flat, 0] if flat.size <= _WIDE else ()
+        for value, most in {**dict.fromkeys(few, 0.5), low: _MOST, high: _MOST}.items():
             share = np.pad((lines == value).mean(axis=1), 1)
             edges = np.flatnonzero(np.diff(np.pad(share[1:-1] == 1, 1).astype(int)))
             for first, last in edges.reshape(-1, 2):
-                alone = max(share[first], share[last + 1]) < _MOST
+                alone = max(share[first], share[last + 1]) < most
                 marked[first:last] |= bool(alone) and last - first <= _WIDE
     for value in (low, high):
         same = (plane == value) & ~found
@@ -250,9 +253,10 @@ def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
 
 
 def pedestal(images: Float[np.ndarray, "*batch y x"]) -> tuple[float, float]:
-    """Highest level of images whose darkest corner is dark and uniform, and its part of the mean.
+    """Furthest level from 0 of images whose darkest corner is dark and uniform.
 
-    Both are 0 where light reaches all corners, or for less than 5 % of the mean light above it.
+    With it, its part of the mean, of the light above where it is negative. Both are 0 where light
+    reaches all corners, or for less than 5 % of the mean light above it.
     """
     planes = images.reshape(-1, *images.shape[-2:])
     side = min(planes.shape[1:]) // _CORNER // 2 * 2
@@ -263,8 +267,9 @@ def pedestal(images: Float[np.ndarray, "*batch y x"]) -> tuple[float, float]:
         dark = min((plane[row, column] for row in ends for column in ends), key=np.mean)
         level, mean = dark.mean(dtype=float), plane.mean(dtype=float)
         quarters = block_sum(dark, side // 2, float) * 4 / side**2
-        if level <= _PEDESTAL * (mean - level) or np.ptp(quarters) > _EVEN * level:
+        size, light = abs(level), mean - level
+        if size <= _PEDESTAL * light or np.ptp(quarters) > _EVEN * size:
             continue
         if is_dark(plane[None], level.reshape(1, 1, 1), side):
-            found.append((float(level), float(level / mean)))
-    return max(found)
+            found.append((float(level), float(level / (light if level < 0 else mean))))
+    return max(found, key=lambda one: abs(one[0]))

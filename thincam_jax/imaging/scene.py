@@ -251,4 +251,9 @@ class Scene(Module):
         """
         from thincam_jax.imaging.targets.images import load_image  # slow, of other libraries
 
+        if not isinstance(path, str | os.PathLike):
+            raise TypeError(
+                f"path is {checks.shown(path)}; give a file, or of an image "
+                "tc.Scene(tc.ImagePlane(image, distance, width), 550e-6)"
+            )
         return cls(ImagePlane(load_image(path), distance, width), wavelength)

@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.progress import watched
 from thincam_jax.imaging.scene import Scene
@@ -16,8 +17,10 @@ from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import AccuracyWarning, Model, PsfMethod, as_method
 from thincam_jax.lensless.mosaic import Mosaic
 from thincam_jax.lensless.plan.run import CapturePlan, run_plan
-from thincam_jax.lensless.resolve import warn_if_unresolved
+from thincam_jax.lensless.resolve import SamplingWarning, warn_if_unresolved
 
+# Pixels that an image is cast on, at fewer of which one of so many rows and columns is not seen.
+_TINY, _PICTURE = 2.0, 8
 _ON_AXIS = (
     "the sensor's angular_response is left out: every point has the light of the axis; give "
     "model=PsfMethod(field_tolerance=1.0)"
@@ -78,6 +81,22 @@ def capture(
     return read_out(camera.sensor, image, noise=noise, key=key)
 
 
+def _warn_if_tiny(camera: LenslessCamera, scene: Scene) -> None:
+    """SamplingWarning, at the caller's caller, for a photograph within a pixel or two."""
+    if checks.holds_traced(camera, scene):
+        return
+    for plane in scene.planes:
+        cast = float(plane.width * camera.distance / plane.distance / camera.sensor.pitch)
+        if cast < _TINY and min(plane.image.shape[-2:]) >= _PICTURE:
+            warnings.warn(
+                f"the scene, {float(plane.width):g} mm wide at {float(plane.distance):g} mm, is "
+                f"cast {cast:.2g} pixels wide by a mask at {float(camera.distance):g} mm: none of "
+                "it is seen; give lengths in mm, or a wider scene",
+                SamplingWarning,
+                stacklevel=4,
+            )
+
+
 def _light(
     camera: LenslessCamera,
     scene: Scene,
@@ -86,6 +105,7 @@ def _light(
 ) -> Float[Array, "*batch y x"]:
     """The noise-free image."""
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
+    _warn_if_tiny(camera, scene)
     if isinstance(model, CapturePlan):
         if pixel_integration is not None:
             raise ValueError("a plan chooses pixel_integration: leave it out")

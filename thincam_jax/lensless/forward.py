@@ -27,6 +27,7 @@ Colours = Sequence[tuple[Number, Number]]
 
 # Pixels by which a field grows where an image moves.
 _STEP = 16
+_WIDE = 8  # times the sensor that a scene is cast, of which units are named
 
 
 def expose(
@@ -128,9 +129,14 @@ def check_memory(sensor: Sensor, field_shape: tuple[int, int], batch: tuple[int,
     cost = convolution_cost(
         sensor.shape, field_shape, math.prod(batch), jnp.dtype(sensor.pitch.dtype).itemsize
     )
+    advice, wider = "", max(n / m for n, m in zip(field_shape, sensor.shape, strict=True))
+    if wider > _WIDE:
+        advice = (
+            f"the scene is cast {wider:.0f} times as wide as the sensor: give lengths in mm, or "
+        )
     refuse_if_too_large(
         f"a capture of {rows}×{columns} pixels of an image projected on "
         f"{field_shape[0]}×{field_shape[1]}",
         cost.bytes,
-        "use a smaller sensor, a smaller scene, or fewer images at a time",
+        f"{advice}use a smaller sensor, a smaller scene, or fewer images at a time",
     )

@@ -71,11 +71,11 @@ def unresolved(frequency: float, pitch: float) -> str:
     nyquist = 1 / (2 * pitch)
     if frequency <= nyquist:
         return ""
-    enough = math.floor(1e4 / (2 * frequency)) / 10
+    enough = math.floor(1e4 / (2 * frequency)) / 10 or 500 / frequency
     return (
         f"the mask casts {frequency:.3g} cycles/mm on pixels that resolve {nyquist:.3g} "
         "(Nyquist, 1/(2 pitch)): what is finer is averaged away or aliased; give a pitch of at "
-        f"most {enough:g} um, or a mask of coarser zones or cells"
+        f"most {enough:.3g} um, or a mask of coarser zones or cells"
     )
 
 

@@ -39,6 +39,8 @@ def read_array(kind: str, data: bytes, key: str | None) -> np.ndarray:
     with contextlib.ExitStack() as opened:
         arrays = OPENERS[kind](data, opened)
         names = ", ".join(arrays) or "no array of numbers"
+        if not arrays:
+            raise ImageFileError(f"holds {names}; save the image by its own name, not in a struct")
         if key is None and len(arrays) != 1:
             raise ImageFileError(f"holds {names}; give one of them as FILE:KEY")
         if key is not None and key not in arrays:

@@ -30,6 +30,8 @@ _TEXTS = {
     "overexposed": "% of the pixels are saturated: the image is a guess there; expose less",
     "underexposed": "% of full scale is the brightest part; expose longer, or give its --bits",
     "cut": "% of its peak varies along its border: what is beyond is missing; compute it: --camera",
+    "size": "times the PSF's rows, and {:.3g} times its columns; give both equally binned, and "
+    "turned alike, or --psf-scale",
     "swapped": "% is not explained by the PSF, which it explains; exchange --psf and --capture",
     "same": "% of the pixels are those of the PSF; give the capture of a scene, not of the point",
     "unexplained": "% of its variation is neither image nor noise; try thincam calibrate check",
@@ -53,7 +55,9 @@ class Finding:
         return f"{self.where}: {self.number:.3g} {self.consequence}; {self.advice}"
 
 
-def finding(name: str, where: str, number: float, severe: bool = False, *words: str) -> Finding:
+def finding(
+    name: str, where: str, number: float, severe: bool = False, *words: str | float
+) -> Finding:
     """Finding of a kind in `_TEXTS`, filled with `words`."""
     consequence, _, advice = _TEXTS[name].format(*words).partition("; ")
     return Finding(name, where, float(number), consequence, advice, severe)
@@ -83,6 +87,7 @@ def examine(
     - unknown: NaN, masked or dead pixels of a PSF. Those of captures are not used, as by `Raw`.
     - mosaic: the means of the pixels of 2×2 differ, but not those of one diagonal, green.
     - exposure, and a PSF whose light varies along its border; a computed one is not examined.
+    - size: a capture and its PSF have different sizes, and no `psf_scale`.
     - swapped: the capture as PSF explains the PSF as capture, and not the reverse; same: both are
       one image.
     """
@@ -113,6 +118,10 @@ def examine(
             findings.append(finding("same", f"capture {images[0].name}", 100.0, True))
         elif 0 < other < left / 2:
             findings.append(finding("swapped", f"capture {images[0].name}", 100 * left, True))
+    for raw in images[:count] if is_measured and options.psf_scale is None else ():
+        rows, columns = np.divide(raw.pixels.shape[:2], images[-1].pixels.shape[:2])
+        if (rows, columns) != (1, 1):
+            findings.append(finding("size", f"capture {raw.name}", rows, True, columns))
     return Examination(tuple(findings), tuple(images[:count]), images[-1] if is_measured else psf)
 
 

@@ -19,6 +19,11 @@ from thincam_jax.measured.raw import MeasurementError, Raw, with_dead
 from thincam_jax.measured.sensor import SensorCalibration
 from thincam_jax.measured.write import Centring, CleanUp, ImageLog, PreparationLog
 
+# Standard deviations of noise, and counts, that more than this share of pixels are below a
+# background; the share of pixels with the least detail, which tell of noise, and the quantile of
+# the absolute values of a normal distribution there.
+_BELOW, _COUNTS, _DARKER, _STILL, _OF_NORMAL = 6.0, 2.0, 0.02, 0.1, 0.1257
+
 Background = Raw | SensorCalibration | float | int | Literal["corner", "found"]
 
 
@@ -109,6 +114,7 @@ def prepare(
     frames = {
         n: _frame(raws[n], plane, backgrounds[n], levels[n], options) for n, plane in planes.items()
     }
+    darker = {n: _darker(raws[n], f) for n, f in frames.items() if levels[n] is not found.levels[n]}
     noise = _noise(frames["psf"].values[found.square].astype(np.float64), options)
     kinds = {n: _kind(b, raws[n], found.sources[n]) for n, b in backgrounds.items()}
     logs = {n: _image_log(raws[n], kinds[n], levels[n], f) for n, f in frames.items()}
@@ -132,6 +138,7 @@ def prepare(
         light = light.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32)
     image = _filled(frames["capture"], "capture")
     sums, divisor = _psf_divisor(light, options), _capture_divisor(image, options)
+    _warn_of_darker(raws, darker)
     valid = frames["capture"].known & ~frames["capture"].saturated
     variance = np.where(valid, frames["capture"].variance / np.float32(divisor**2), np.inf)
     variance = variance if isinstance(backgrounds["capture"], SensorCalibration) else None
@@ -219,6 +226,30 @@ def _frame(
     light, variance = (one[None].astype(np.float32) for one in background.correct(raw))
     scale = np.float32(raw.full_scale)
     return _Frame(light / scale, saturated, good & ~background.defective, variance / scale**2)
+
+
+def _darker(raw: Raw, frame: _Frame) -> float:
+    """Share of pixels that are darker than the background that was subtracted by more than noise.
+
+    The noise is that of the pixels with the least detail: where a code is fine, there are few.
+    """
+    if min(frame.shape) < 8:
+        return 0.0
+    bends = np.diff(np.diff(frame.values, 2, axis=1), 2, axis=2)  # of 6 times the noise
+    noise = np.quantile(np.abs(bends), _STILL, axis=(1, 2), keepdims=True) / (6 * _OF_NORMAL)
+    below = frame.values < -_BELOW * noise - _COUNTS / raw.full_scale
+    return float((below & frame.known).mean())
+
+
+def _warn_of_darker(raws: dict[str, Raw], shares: dict[str, float]) -> None:
+    for name, share in shares.items():
+        if share > _DARKER:
+            warnings.warn(
+                f"{raws[name].name}: {100 * share:.0f} % of its pixels are darker than the "
+                "background that was given, and become black; leave it out, or give one of this "
+                "exposure",
+                stacklevel=4,
+            )
 
 
 def _in_full_scale(raw: Raw) -> np.ndarray:

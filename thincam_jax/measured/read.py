@@ -31,12 +31,13 @@ from thincam_jax._core.image_files import (
     tiff_pages,
     whole_of,
 )
-from thincam_jax.imaging.encoding import ORIENTATION, upright
+from thincam_jax.imaging.encoding import ORIENTATION, decoded, upright
 from thincam_jax.measured.bayer import PATTERNS, turned_pattern
 from thincam_jax.measured.containers import OPENERS, read_array, read_bare, read_pgm
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
-_Facts = dict[str, Any]  # bits, orientation, and those of `Raw`, where a file says them
+# Bits, orientation, whether it is encoded, and those of `Raw`, where a file says them.
+_Facts = dict[str, Any]
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy", ".pgm", ".ppm", ".fits", *RAW_SUFFIXES)
 _KEYED = re.compile(r"(?i)(.+\.(?:npz|mat|h5|hdf5|fits?)):(.+)")
@@ -56,11 +57,16 @@ _PLAIN = (
     tifffile.PHOTOMETRIC.LINEAR_RAW,
 )
 _UNDAMAGED = "give an undamaged TIFF, PNG, JPEG or NPY file"
-_EXIF, _EXPOSURE_TIME = 34665, 33434  # tags
+_EXIF, _EXPOSURE_TIME, _PROFILE = 34665, 33434, 34675  # tags
+_BENT = 0.02  # light of a code of one half beside it, from which on a curve is said
 _FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}  # orientations by LibRaw
 _NONLINEAR = (
     "a JPEG's counts are not in proportion to the light (gamma, tone curve, compression), so that "
     "images show rings and wrong greys; save the camera's raw frames as TIFF or PNG"
+)
+_ENCODED = (
+    "its tags say that its counts are codes for displays (gamma), not in proportion to the light; "
+    "give raw frames, or numpy.save('{}', thincam_jax.load_image('{}'))"
 )
 
 
@@ -87,6 +93,10 @@ def read_image(path: str | os.PathLike[str], *, bits: int | None = None) -> Raw:
     image, for a stack of images, and for everything that `Raw` refuses.
     """
     (pixels,), kind, facts = _decode(Path(path))
+    if facts.get("encoded") and kind != "jpeg":  # which warns itself
+        linear = Path(path).with_suffix(".npy")
+        text = _ENCODED.format(linear, path)
+        warnings.warn(f"{path}: {text}", NonlinearWarning, stacklevel=2)
     return _raw(pixels, bits, kind, str(path), facts)
 
 
@@ -114,7 +124,7 @@ def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[R
 
 def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str, facts: _Facts) -> Raw:
     """The image, upright, with the facts of its file."""
-    facts = dict(facts)
+    facts = {name: one for name, one in facts.items() if name != "encoded"}
     found, orientation = facts.pop("bits", None), facts.pop("orientation", 1)
     if bits is not None and "white_level" in facts and bits != found:
         raise CaptureFileError(
@@ -328,7 +338,15 @@ def _by_pillow(data: bytes) -> tuple[np.ndarray, _Facts]:
     with opened(data) as file:
         exif = file.getexif()
         time = exif.get_ifd(_EXIF).get(_EXPOSURE_TIME)
-        return np.array(file), {"orientation": exif.get(ORIENTATION, 1), **_exposure(time)}
+        if file.mode == "CMYK":
+            raise CaptureFileError("stores colours as CMYK, no counts; save it as grey or RGB")
+        facts = {"orientation": exif.get(ORIENTATION, 1), "encoded": _is_encoded(file.info)}
+        return np.array(file), facts | _exposure(time)
+
+
+def _is_encoded(tags: Any) -> bool:
+    """Whether a profile, a mark of sRGB or a gamma says that codes are not linear."""
+    return abs(float(decoded(np.array([0.5]), tags, photograph=False)[0]) - 0.5) > _BENT
 
 
 def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], _Facts]:
@@ -395,6 +413,7 @@ def _tiff_facts(page: tifffile.TiffPage) -> tuple[_Facts, Any, Any]:
     bits, facts = page.bitspersample, {"orientation": page.tags.valueof(ORIENTATION, 1)}
     exif = page.tags.valueof(_EXIF, {}) or {}
     facts |= _exposure(exif.get("ExposureTime"), page.tags.valueof(_EXPOSURE_TIME))
+    facts["encoded"] = _is_encoded({"icc_profile": page.tags.valueof(_PROFILE, b"")})
     if page.dtype is not None and page.dtype.kind == "u" and isinstance(bits, int):
         facts |= {"bits": bits} if 8 <= bits <= 16 else {}
     if page.photometric != tifffile.PHOTOMETRIC.CFA:

@@ -328,6 +328,11 @@ def pedestal_of(model: object) -> str:
     level, share = pedestal(np.asarray(model.psfs))
     if level == 0:
         return ""
+    if level < 0:
+        return (
+            f"a PSF is {level:.3g} where it is dark, {-100 * share:.0f} % of its mean light below "
+            f"0: too large a background was subtracted; give tc.Psfs(psfs + {-level:.3g})"
+        )
     return (
         f"a PSF is {level:.3g} where it is dark, {100 * share:.0f} % of its mean: give "
         f"tc.Psfs(psfs - {level:.3g}), of files --psf-background"

@@ -9,8 +9,9 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators.low_rank import LowRank
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
-from thincam_jax.reconstruction.imaging_model import pedestal_of
+from thincam_jax.reconstruction.imaging_model import Psfs, pedestal_of
 from thincam_jax.reconstruction.iterate import Callback
+from thincam_jax.reconstruction.noise import too_noisy
 from thincam_jax.reconstruction.other_psf import negative_behind_operators
 from thincam_jax.reconstruction.poisson import PoissonTV
 from thincam_jax.reconstruction.recording import Recording
@@ -93,7 +94,21 @@ def _reconstruct(recording: Recording, solver, start, callback, tell) -> Reconst
     else:
         result = solver.solve(recording)
     negative, level = negative_behind_operators(recording), pedestal_of(recording.imaging_model)
-    return saying(result, reason, result.reason, negative, level)
+    unlike, noise = _unlike(recording, result.reason), ""
+    if isinstance(recording.imaging_model, Psfs):
+        noise = too_noisy(recording.captures, recording.valid, recording.noise_variance)
+    return saying(result, reason, result.reason, unlike, negative, level, noise)
+
+
+def _unlike(recording: Recording, reason: str) -> str:
+    """A sentence where a measured PSF that misfits has another size than the captures."""
+    model, shape = recording.imaging_model, recording.captures[0].shape[-2:]
+    if not reason or not isinstance(model, Psfs) or (size := model.psfs.shape[-2:]) == shape:
+        return ""
+    if not any(words in reason for words in ("residual", "fit far better a PSF")):
+        return ""
+    text = f"the PSF has {size[0]}×{size[1]} pixels and the captures {shape[0]}×{shape[1]}"
+    return f"{text}: give both equally binned, and turned alike"
 
 
 @checked

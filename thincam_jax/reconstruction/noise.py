@@ -16,6 +16,9 @@ from thincam_jax.imaging.defects import defects, plateau, stuck
 from thincam_jax.imaging.operators import AbstractOperator, Separable
 from thincam_jax.reconstruction.unseen import unseen_defects
 
+# Standard deviations that a given one is above that found, and the least side of a capture.
+_TOO_NOISY, _SMALL, TOO_NOISY = 3.0, 16, "noise_variance is too large:"
+
 
 def without_unknown(capture: Any) -> tuple[Any, np.ndarray | None]:
     """A capture with 0 for what is masked or NaN, and where it is known; None: everywhere."""
@@ -259,6 +262,23 @@ def estimate_variance(
     masks = [None] * len(captures) if valid is None else valid
     deviations = [estimate_noise(c, m) for c, m in zip(captures, masks, strict=True)]
     return _variances(deviations, list(captures))
+
+
+def too_noisy(captures: Sequence[Any], valid: Sequence[Any] | None, given: Any) -> str:
+    """A sentence where a variance was given far above that of the finest detail, else nothing.
+
+    Detail of a fine code is taken for noise, so that the estimate is too large rather than small.
+    """
+    if given is None or checks.holds_traced((captures, valid, given)):
+        return ""
+    if any(one.ndim < 2 or min(one.shape[-2:]) < _SMALL for one in captures):
+        return ""
+    variances = np.broadcast_to(np.asarray(given_variances(given, captures)), len(captures))
+    found = np.asarray(estimate_variance(captures, valid))
+    if not (variances > _TOO_NOISY**2 * found).any():
+        return ""
+    n = int(np.argmax(variances / found))
+    return f"{TOO_NOISY} {variances[n]:.3g} of which {found[n]:.3g} is found; leave it out"
 
 
 @jax.jit

@@ -62,7 +62,13 @@ def record(
 
     **See also**: `capture`, `Recording`, `Scene.photograph`.
     """
-    noise = GaussianNoise(noise) if isinstance(noise, float | int) else noise
+    if isinstance(noise, float | int):
+        if noise <= 0:
+            raise ValueError(
+                f"noise = {noise:g} dB is as much noise as light, or more; give None for none, or "
+                f"tc.GaussianNoise({noise:g}) for so much"
+            )
+        noise = GaussianNoise(noise)
     if not isinstance(camera, LenslessCamera | Mosaic | Sequence):
         if model != "separable":
             raise TypeError(f"model = {checks.shown(model)} is of a mask's PSF; leave it out here")

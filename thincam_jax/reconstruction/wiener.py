@@ -104,6 +104,11 @@ class WienerSynthesis(eqx.Module):
     ):
         checks.choice("prior", prior, ("inverse_square", "flat"))
         cameras.require("wavelength", "object_distance")
+        if np.ndim(cameras.object_distance) > 0:
+            raise ValueError(
+                "object_distance has several planes, which a filter does not separate; give "
+                "'admm_tv' as solver, or one distance"
+            )
         each = cameras.cameras
         capture_ratios = distance_ratios(each)
         if synthesis is None:
