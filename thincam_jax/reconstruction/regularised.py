@@ -125,7 +125,7 @@ class AbstractRegularised(AbstractIterativeSolver):
 
     def _iterated(
         self, recording: Recording, start: Float[Array, "..."] | None, callback: Callback | None
-    ) -> tuple[InverseProblem, Outcome, Image | None]:
+    ) -> tuple[InverseProblem, Outcome, Float[Array, "plane 1 1"] | None]:
         """The problem, its outcome, and the unit by which planes are divided, if there is one."""
         rule, reason = (self.tau if isinstance(self.tau, str) else None), ""
         problem = recording.problem(
@@ -169,7 +169,7 @@ class AbstractRegularised(AbstractIterativeSolver):
         return problem, outcome, unit
 
 
-def _over(outcome: Outcome, unit: Image | None) -> Outcome:
+def _over(outcome: Outcome, unit: Float[Array, "plane 1 1"] | None) -> Outcome:
     return outcome if unit is None else dataclasses.replace(outcome, image=outcome.image / unit)
 
 
