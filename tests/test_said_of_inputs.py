@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import thincam_jax as tc
 from thincam_jax.commands import cli
-from thincam_jax.imaging.defects import stuck
+from thincam_jax.imaging.defects import stuck, wrapped
 from thincam_jax.lensless.resolve import SamplingWarning
 from thincam_jax.measured import Raw, examine, prepare, read_image
 from thincam_jax.measured.raw import MeasurementError
@@ -106,6 +106,24 @@ def test_dead_lines_whose_background_was_subtracted(lines):
     assert not stuck(columns.astype(np.float32))[:, 1:-1].any()
 
 
+@pytest.mark.parametrize("camera", [spots, diffuser, cells, zones])
+def test_unsigned_counts_below_their_background(camera):
+    """A black level subtracted in uint16 makes dark pixels the brightest ones."""
+    psf, capture = light_of(camera)
+    below = psf - np.uint16(DARK)
+    with pytest.raises(MeasurementError, match="negative numbers in uint16"):
+        Raw(below)
+    with pytest.raises(ValueError, match=r"negative .* subtract from image.astype\(float\)"):
+        tc.Psfs(below[None])
+    if camera is spots:  # whose capture has dark pixels
+        with pytest.raises(ValueError, match="a capture: .* negative numbers in uint16"):
+            tc.Recording([capture - np.uint16(DARK)], tc.Psfs(psf[None]))
+    for clean in (psf, capture, 16 * capture, np.maximum(psf, DARK) - np.uint16(DARK)):
+        assert not wrapped(clean)
+    full = np.random.default_rng(0).integers(0, 2**16, (160, 200)).astype(np.uint16)
+    assert not wrapped(full) and not wrapped(np.where(full > 40000, 65535, full // 999))
+
+
 def of_files(psf, capture, **given):
     recording = tc.Recording([capture], tc.Psfs(psf[None]), **given)
     result = tc.reconstruct(recording, tc.AdmmTV(iterations=60))
@@ -160,6 +178,12 @@ def test_lengths_in_metres_or_micrometres(optics, view):
         warnings.simplefilter("error")
         tc.record(camera(), picture())
         tc.record(camera(), tc.Scene(tc.ImagePlane([[1.0]], 250.0, 0.04), 500 * nm))
+
+
+def test_a_mask_in_micrometres():
+    for mask in (tc.FresnelZoneAperture(1e-3, width=1600.0), tc.SampledMask(np.eye(40), 40.0)):
+        with pytest.warns(SamplingWarning, match="1.6e\\+03 mm wide, 1000 times the sensor"):
+            tc.capture(camera(mask=mask), picture())
 
 
 @pytest.mark.parametrize("view", [{"distance": 0.25}, {"width": 4e4}])

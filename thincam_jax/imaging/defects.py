@@ -16,6 +16,8 @@ _ISOLATED = 3.0  # times the range of the neighbours, by which a defective pixel
 _CERTAIN = 8.0  # standard deviations of the noise, or counts
 _SPREAD = 0.1  # share of a point of light that its neighbours have at least
 _OUTER = np.flatnonzero(np.pad(np.zeros((3, 3)), 1, constant_values=1))  # of 5×5 pixels
+# 16 bit as signed: numbers around 0, their least share, and different ones on each side.
+_SIGNED, _NEAR, _OFTEN, _SIDES = 2**15, 12, 1e-3, 3
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 _SWEEPS = 30  # of a relaxation, from means of blocks
 _MOST, _WIDE = 0.1, 4  # share of pixels at one value, and width of lines, that are stuck
@@ -37,6 +39,31 @@ def plateau(pixels: Shaped[np.ndarray, "*shape"]) -> int:
     kept = min(below.size, below.size // 8 + 1000)
     _, counts = np.unique(np.partition(below, -kept)[-kept:], return_counts=True)
     return count if counts.size >= 16 and count > _STEEP * counts[-8:].max() else 0
+
+
+def wrapped(pixels: np.ndarray) -> float:
+    """Share of 16-bit counts that are negative numbers, 65535 for −1; 0 where they are none.
+
+    The numbers on both sides of 0 are then taken as often; counts spread over more of the range,
+    or are one value where they are cut off.
+    """
+    if pixels.dtype != np.uint16 or pixels.size == 0 or int(pixels.max()) < _SIGNED:
+        return 0.0
+    signed = pixels.astype("=u2").view(np.int16)
+    near = signed[np.abs(signed.astype(np.int32)) <= _NEAR]
+    sides = [near[near < 0], near[near > 0]]
+    if min(one.size for one in sides) <= max(_SIDES, _OFTEN * pixels.size):
+        return 0.0
+    is_wrapped = min(np.unique(one).size for one in sides) >= _SIDES
+    return float(np.mean(signed < 0)) if is_wrapped else 0.0
+
+
+def wrapped_words(share: float) -> str:
+    """Words for such a share, and what to do."""
+    return (
+        f"{100 * share:.2g} % of the counts are negative numbers in uint16, 65535 for -1; subtract "
+        "from image.astype(float), or give the background"
+    )
 
 
 def defects(plane: Float[np.ndarray, "y x"], step: float = 0.0) -> Bool[np.ndarray, "y x"]:

@@ -21,6 +21,7 @@ from thincam_jax.lensless.resolve import SamplingWarning, warn_if_unresolved
 
 # Pixels that an image is cast on, at fewer of which one of so many rows and columns is not seen.
 _TINY, _PICTURE = 2.0, 8
+_HUGE, _LARGEST = 100.0, 500.0  # times the sensor, and mm, that a mask in other units is wide
 _ON_AXIS = (
     "the sensor's angular_response is left out: every point has the light of the axis; give "
     "model=PsfMethod(field_tolerance=1.0)"
@@ -85,6 +86,15 @@ def _warn_if_tiny(camera: LenslessCamera, scene: Scene) -> None:
     """SamplingWarning, at the caller's caller, for a photograph within a pixel or two."""
     if checks.holds_traced(camera, scene):
         return
+    mask = float(max(camera.mask.extent))
+    sensor = max(camera.sensor.shape) * float(camera.sensor.pitch)
+    if mask > max(_HUGE * sensor, _LARGEST):
+        warnings.warn(
+            f"the mask is {mask:.3g} mm wide, {mask / sensor:.0f} times the sensor, which sees "
+            "nothing of its structure; give lengths in mm",
+            SamplingWarning,
+            stacklevel=4,
+        )
     for plane in scene.planes:
         cast = float(plane.width * camera.distance / plane.distance / camera.sensor.pitch)
         if cast < _TINY and min(plane.image.shape[-2:]) >= _PICTURE:

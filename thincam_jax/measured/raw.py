@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers, without_mask
 from thincam_jax._core.files import MeasurementError
-from thincam_jax.imaging.defects import filled_by_neighbours
+from thincam_jax.imaging.defects import filled_by_neighbours, wrapped, wrapped_words
 from thincam_jax.measured.bayer import Pattern
 
 MAX_CHANNELS = 4
@@ -138,6 +138,8 @@ def _check_shape(name: str, pixels: np.ndarray) -> None:
 
 def _check_type(name: str, pixels: np.ndarray) -> None:
     kind, size = pixels.dtype.kind, pixels.dtype.itemsize
+    if share := wrapped(pixels):
+        raise MeasurementError(f"{name}: {wrapped_words(share)}")
     if (kind == "u" and size <= 2) or (kind == "f" and size <= 8):
         return
     advice = {

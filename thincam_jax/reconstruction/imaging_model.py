@@ -16,7 +16,7 @@ from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity, unchecked
-from thincam_jax.imaging.defects import pedestal
+from thincam_jax.imaging.defects import pedestal, wrapped, wrapped_words
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.operators.low_rank import LowRank, Resampled
 from thincam_jax.imaging.scene import Spectrum
@@ -289,6 +289,8 @@ class Psfs(Module):
     field_shape: tuple[int, int] | None = eqx.field(static=True)
 
     def __init__(self, psfs: Numbers, *, field_shape: Shape | None = None):
+        if isinstance(psfs, np.ndarray) and (share := wrapped(psfs)):
+            raise ValueError(f"psfs: {wrapped_words(share)}")
         psfs = checks.array("psfs", psfs)
         if not 3 <= psfs.ndim <= 5 or 0 in psfs.shape:
             raise ValueError(_PSF_SHAPE.format(psfs.shape))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax.imaging.defects import defects, plateau, stuck
+from thincam_jax.imaging.defects import defects, plateau, stuck, wrapped, wrapped_words
 from thincam_jax.imaging.operators import AbstractOperator, Separable
 from thincam_jax.reconstruction.unseen import unseen_defects
 
@@ -26,6 +26,8 @@ def without_unknown(capture: Any) -> tuple[Any, np.ndarray | None]:
         array = None if checks.holds_traced(capture) else checks.native(capture)
     except (TypeError, ValueError, RecursionError):  # refused by `as_real`, in words
         return capture, None
+    if array is not None and (share := wrapped(array)):
+        raise ValueError(f"a capture: {wrapped_words(share)}")
     if array is None or array.dtype.kind != "f" or not (unknown := np.isnan(array)).any():
         return capture, None
     return np.where(unknown, np.zeros((), array.dtype), array), ~unknown
