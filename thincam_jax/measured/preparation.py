@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Float32
+from numpy.lib.stride_tricks import sliding_window_view
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
@@ -235,8 +236,13 @@ def _darker(raw: Raw, frame: _Frame) -> float:
     """
     if min(frame.shape) < 8:
         return 0.0
-    bends = np.diff(np.diff(frame.values, 2, axis=1), 2, axis=2)  # of 6 times the noise
-    noise = np.quantile(np.abs(bends), _STILL, axis=(1, 2), keepdims=True) / (6 * _OF_NORMAL)
+    bends = np.abs(np.diff(np.diff(frame.values, 2, axis=1), 2, axis=2))  # of 6 times the noise
+    usable = frame.known & ~frame.saturated  # a plateau has no noise
+    for axis in (1, 2):
+        usable = sliding_window_view(usable, 3, axis=axis).all(axis=-1)
+    parts = (bend[use] for bend, use in zip(bends, usable, strict=True))
+    still = [np.quantile(part, _STILL) if part.size else np.inf for part in parts]
+    noise = np.reshape(still, (-1, 1, 1)) / (6 * _OF_NORMAL)
     below = frame.values < -_BELOW * noise - _COUNTS / raw.full_scale
     return float((below & frame.known).mean())
 
