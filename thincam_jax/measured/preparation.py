@@ -239,7 +239,7 @@ def _darker(raw: Raw, frame: _Frame) -> float:
     bends = np.abs(np.diff(np.diff(frame.values, 2, axis=1), 2, axis=2))  # of 6 times the noise
     usable = frame.known & ~frame.saturated  # a plateau has no noise
     for axis in (1, 2):
-        usable = sliding_window_view(usable, 3, axis=axis).all(axis=-1)
+        usable = np.min(sliding_window_view(usable, 3, axis=axis), axis=-1)
     parts = (bend[use] for bend, use in zip(bends, usable, strict=True))
     still = [np.quantile(part, _STILL) if part.size else np.inf for part in parts]
     noise = np.reshape(still, (-1, 1, 1)) / (6 * _OF_NORMAL)
