@@ -93,11 +93,14 @@ def read_image(path: str | os.PathLike[str], *, bits: int | None = None) -> Raw:
     image, for a stack of images, and for everything that `Raw` refuses.
     """
     (pixels,), kind, facts = _decode(Path(path))
-    if facts.get("encoded") and kind != "jpeg":  # which warns itself
-        linear = Path(path).with_suffix(".npy")
-        text = _ENCODED.format(linear, path)
-        warnings.warn(f"{path}: {text}", NonlinearWarning, stacklevel=2)
+    _warn_of_codes(Path(path), kind, facts)
     return _raw(pixels, bits, kind, str(path), facts)
+
+
+def _warn_of_codes(path: Path, kind: str, facts: _Facts) -> None:
+    if facts.get("encoded") and kind != "jpeg":  # which warns itself
+        text = _ENCODED.format(path.with_suffix(".npy"), path)
+        warnings.warn(f"{path}: {text}", NonlinearWarning, stacklevel=3)
 
 
 def read_photograph(data: bytes, name: str, bits: int | None = None) -> Raw:
@@ -119,12 +122,14 @@ def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[R
     if path.is_dir():
         return [read_image(one, bits=bits) for one in image_files(path)]
     pages, kind, facts = _decode(path, stack=True)
+    _warn_of_codes(path, kind, facts)
     return [_raw(page, bits, kind, f"{path}, image {n}", facts) for n, page in enumerate(pages, 1)]
 
 
 def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str, facts: _Facts) -> Raw:
     """The image, upright, with the facts of its file."""
-    facts = {name: one for name, one in facts.items() if name != "encoded"}
+    facts = dict(facts)
+    facts.pop("encoded", None)  # no fact of `Raw`
     found, orientation = facts.pop("bits", None), facts.pop("orientation", 1)
     if bits is not None and "white_level" in facts and bits != found:
         raise CaptureFileError(
