@@ -82,8 +82,8 @@ def capture(
     return read_out(camera.sensor, image, noise=noise, key=key)
 
 
-def _warn_if_tiny(camera: LenslessCamera, scene: Scene) -> None:
-    """SamplingWarning, at the caller's caller, for a photograph within a pixel or two."""
+def _warn_of_units(camera: LenslessCamera, scene: Scene) -> None:
+    """SamplingWarning, at the caller's caller, for sizes that are none in mm."""
     if checks.holds_traced(camera, scene):
         return
     mask = float(max(camera.mask.extent))
@@ -115,7 +115,7 @@ def _light(
 ) -> Float[Array, "*batch y x"]:
     """The noise-free image."""
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
-    _warn_if_tiny(camera, scene)
+    _warn_of_units(camera, scene)
     if isinstance(model, CapturePlan):
         if pixel_integration is not None:
             raise ValueError("a plan chooses pixel_integration: leave it out")

@@ -115,7 +115,8 @@ def prepare(
     frames = {
         n: _frame(raws[n], plane, backgrounds[n], levels[n], options) for n, plane in planes.items()
     }
-    darker = {n: _darker(raws[n], f) for n, f in frames.items() if levels[n] is not found.levels[n]}
+    given = [n for n, one in backgrounds.items() if not isinstance(one, str)]
+    darker = {n: _darker(raws[n], frames[n]) for n in given}
     noise = _noise(frames["psf"].values[found.square].astype(np.float64), options)
     kinds = {n: _kind(b, raws[n], found.sources[n]) for n, b in backgrounds.items()}
     logs = {n: _image_log(raws[n], kinds[n], levels[n], f) for n, f in frames.items()}

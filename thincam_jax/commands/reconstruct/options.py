@@ -87,7 +87,7 @@ def read_method(text: str) -> str:
 
     That of a shipped one, such as "diffusercam", has the camera's name.
     """
-    if not Path(text).suffix and (shipped := _SHIPPED / f"{Path(text).name}{_TRAINED}").is_file():
+    if text == Path(text).stem and (shipped := _SHIPPED / f"{text}{_TRAINED}").is_file():
         return str(shipped)
     return str(Path(text).resolve()) if is_trained(text) else text.replace("-", "_")
 
