@@ -66,11 +66,25 @@ def reconstruct(
 
     **See also**: `Recording`, `AdmmTV`, `Wiener`, `choose_solver`.
     """
+    result = solved(recording, solver, start, callback)
+    if not isinstance(recording.imaging_model, Psfs):
+        return result
+    noise = too_noisy(recording.captures, recording.valid, recording.noise_variance)
+    return saying(result, result.reason, noise)
+
+
+def solved(
+    recording: Recording,
+    solver: AbstractSolver | str | None = None,
+    start: Float[Array, "..."] | None = None,
+    callback: Callback | None = None,
+) -> Reconstruction:
+    """The result of `reconstruct`, where the noise was estimated and need not be doubted."""
     with watched("reconstructing") as tell:
-        return _reconstruct(recording, solver, start, callback, tell)
+        return _solved(recording, solver, start, callback, tell)
 
 
-def _reconstruct(recording: Recording, solver, start, callback, tell) -> Reconstruction:
+def _solved(recording: Recording, solver, start, callback, tell) -> Reconstruction:
     reason = ""
     if solver is None:
         solver, reason = choose_solver(recording)
@@ -94,10 +108,8 @@ def _reconstruct(recording: Recording, solver, start, callback, tell) -> Reconst
     else:
         result = solver.solve(recording)
     negative, level = negative_behind_operators(recording), pedestal_of(recording.imaging_model)
-    unlike, noise = _unlike(recording, result.reason), ""
-    if isinstance(recording.imaging_model, Psfs):
-        noise = too_noisy(recording.captures, recording.valid, recording.noise_variance)
-    return saying(result, reason, result.reason, unlike, negative, level, noise)
+    unlike = _unlike(recording, result.reason)
+    return saying(result, reason, result.reason, unlike, negative, level)
 
 
 def _unlike(recording: Recording, reason: str) -> str:

@@ -17,7 +17,7 @@ from thincam_jax.imaging.operators import AbstractOperator, Separable
 from thincam_jax.reconstruction.unseen import unseen_defects
 
 # Standard deviations that a given one is above that found, and the least side of a capture.
-_TOO_NOISY, _SMALL, TOO_NOISY = 3.0, 16, "noise_variance is too large:"
+_TOO_NOISY, _SMALL = 3.0, 16
 
 
 def without_unknown(capture: Any) -> tuple[Any, np.ndarray | None]:
@@ -280,7 +280,10 @@ def too_noisy(captures: Sequence[Any], valid: Sequence[Any] | None, given: Any) 
     if not (variances > _TOO_NOISY**2 * found).any():
         return ""
     n = int(np.argmax(variances / found))
-    return f"{TOO_NOISY} {variances[n]:.3g} of which {found[n]:.3g} is found; leave it out"
+    return (
+        f"noise_variance is too large: {variances[n]:.3g} of which {found[n]:.3g} is found; leave "
+        "it out"
+    )
 
 
 @jax.jit

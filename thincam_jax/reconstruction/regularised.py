@@ -163,9 +163,8 @@ class AbstractRegularised(AbstractIterativeSolver):
 
             outcome = with_smooth_light(whole, outcome, minimise, self.iterations)
         if rule:
-            said = "; ".join(one for one in (reason, outcome.reason) if one)
-            seconds = time.perf_counter() - began
-            outcome = dataclasses.replace(outcome, seconds=seconds, reason=said)
+            outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
+            outcome = saying(outcome, reason, outcome.reason)
         return problem, outcome, unit
 
 

@@ -1,6 +1,7 @@
 """Reconstructed images."""
 
 import dataclasses
+from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import unchecked
-from thincam_jax.reconstruction.iterate import Progress
+from thincam_jax.reconstruction.iterate import Outcome, Progress
 
 
 class Reconstruction(Module):
@@ -70,7 +71,10 @@ class Reconstruction(Module):
         return as_png(draw_result(self))
 
 
-def saying(result: Reconstruction, *reasons: str) -> Reconstruction:
+AnyResult = TypeVar("AnyResult", Reconstruction, Outcome)
+
+
+def saying(result: AnyResult, *reasons: str) -> AnyResult:
     """A result whose reason is these, those that are not empty."""
     said = "; ".join(filter(None, reasons))
     return dataclasses.replace(result, reason=said) if said else result

@@ -20,7 +20,7 @@ from thincam_jax.measured.preparation import Prepared
 from thincam_jax.reconstruction import AbstractSolver, InverseProblem
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Callback, Progress
-from thincam_jax.reconstruction.methods import reconstruct
+from thincam_jax.reconstruction.methods import solved
 from thincam_jax.reconstruction.noise import demosaiced_noise, estimate_variance
 from thincam_jax.reconstruction.problem import relative_residual
 from thincam_jax.reconstruction.recording import Recording
@@ -223,5 +223,5 @@ def reconstruct_prepared(
         "give a larger downsample",
     )
     recording = prepared_recording(prepared, noise)
-    found = reconstruct(recording, solver, callback=callback)
+    found = solved(recording, solver, callback=callback)
     return PreparedResult(recording, solver, found, noise)

@@ -107,7 +107,7 @@ def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, ro
 
 def test_what_overflows_is_not_written(folder, tmp_path, monkeypatch):
     lost = Reconstruction(jnp.full((1, 2, 3), jnp.nan), None, ended="iterations_exhausted")
-    monkeypatch.setattr(prepared, "reconstruct", lambda *_, **__: lost)
+    monkeypatch.setattr(prepared, "solved", lambda *_, **__: lost)
     output = Output(tmp_path / "first.png")
     planned = plan_jobs(folder / "first.tif", sources(folder), output)
     (result,) = run_jobs(planned, sources(folder), Recipe(tau=1e5), output)

@@ -33,7 +33,6 @@ from thincam_jax.reconstruction import TotalVariation
 from thincam_jax.reconstruction.depth.find import depth_of_colours
 from thincam_jax.reconstruction.iterate import Progress
 from thincam_jax.reconstruction.methods import choose_solver
-from thincam_jax.reconstruction.noise import TOO_NOISY
 from thincam_jax.reconstruction.other_psf import NEGATIVE, RESIZE, TURN
 from thincam_jax.reconstruction.psf_check import blocks_blur, check_psf
 from thincam_jax.reconstruction.refinement import changed_psf, refine
@@ -262,7 +261,7 @@ def _left(ready: Prepared, done: PreparedResult) -> tuple[float, float]:
 def _doubts(job: Job, ready: Prepared, done: PreparedResult) -> Iterator[Finding]:
     """A residual far above the noise, and a given noise that is not the one found."""
     where, (left, least) = f"capture {job.capture}", _left(ready, done)
-    if (why := done.found.reason) and not why.startswith(TOO_NOISY):  # "noise" says it
+    if why := done.found.reason:
         yield finding(
             "misfit", where, 3 * left / least, why.endswith((TURN, RESIZE, NEGATIVE)), why
         )
