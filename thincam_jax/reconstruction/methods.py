@@ -8,6 +8,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.progress import watched
 from thincam_jax.imaging.operators.low_rank import LowRank
+from thincam_jax.reconstruction.display_codes import display_codes
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.imaging_model import Psfs, pedestal_of
 from thincam_jax.reconstruction.iterate import Callback
@@ -109,7 +110,9 @@ def _solved(recording: Recording, solver, start, callback, tell) -> Reconstructi
         result = solver.solve(recording)
     negative, level = negative_behind_operators(recording), pedestal_of(recording.imaging_model)
     unlike = _unlike(recording, result.reason)
-    return saying(result, reason, result.reason, unlike, negative, level)
+    is_filter = isinstance(solver, Wiener | FringeScanning)
+    codes = "" if is_filter else display_codes(recording)
+    return saying(result, reason, result.reason, unlike, negative, level, codes)
 
 
 def _unlike(recording: Recording, reason: str) -> str:

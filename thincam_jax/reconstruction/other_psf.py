@@ -34,7 +34,7 @@ _SCALES = (0.94, 0.97, 1.03, 1.06)
 _COARSER = 2  # times twice as large
 _BETTER = 0.85  # of the objective
 _FAR_BETTER = 0.5  # of the objective, where noise that falls does not tell of inversion
-_LARGEST = 256  # pixels of the shorter side that are solved for this
+LARGEST = 256  # pixels of the shorter side that are solved for this
 # Iterations that tell of an objective, and the residual over the noise that inverted captures leave
 # at most: 1.0 to 1.3, those of a wrong PSF 1.5 and more.
 _ENOUGH, _EXPLAINED = 40, 1.4
@@ -56,7 +56,7 @@ def better_psf(
     """
     problem, image, _ = coarsened(problem, image, _COARSER)
     operators = convolutions(problem)
-    if operators is None or min(problem.field_shape) > _LARGEST:
+    if operators is None or min(problem.field_shape) > LARGEST:
         return ""
 
     def objective(change) -> float:
@@ -128,7 +128,7 @@ def _inverse_share(problem: InverseProblem) -> float | None:
     """
     if convolutions(problem) is None or problem.image_shape[-3] > 1:
         return None
-    growth = _noise_growth(problem)
+    growth = noise_growth(problem)
     return None if growth > _GROWS else 1.0 if growth < _FALLS else _FAR_BETTER
 
 
@@ -146,7 +146,7 @@ def inverted(problem: InverseProblem) -> InverseProblem:
     return problem if problem.has_background else with_other_background(problem, "unknown")
 
 
-def _noise_growth(problem: InverseProblem) -> float:
+def noise_growth(problem: InverseProblem) -> float:
     """Median detail of the brightest quarter of the captures' pixels over that of the darkest."""
     found = []
     for capture, weight in zip(problem.captures, problem.weights, strict=True):

@@ -237,7 +237,7 @@ class AdmmTV(AbstractRegularised):
         if misfit is None:
             return outcome
         if misfit.is_suspect:
-            better = better_psf(problem, image, self._lowest, not misfit.is_smooth)
+            better = better_psf(problem, image, self.lowest_objective, not misfit.is_smooth)
             if better:
                 return dataclasses.replace(outcome, reason=better)
         if outcome.status != "converged":  # what is left is not yet misfit
@@ -254,8 +254,8 @@ class AdmmTV(AbstractRegularised):
             outcome = dataclasses.replace(outcome, seconds=seconds)
         return dataclasses.replace(outcome, reason=said)
 
-    def _lowest(self, problem: InverseProblem, image: Image) -> float:
-        """The lowest objective, roughly."""
+    def lowest_objective(self, problem: InverseProblem, image: Image) -> float:
+        """The lowest objective, roughly, from a start image."""
         return float(self._rough._from_nothing(problem, image, None).history[-1].objective)
 
     @property
