@@ -11,6 +11,7 @@ from PIL.PngImagePlugin import PngInfo
 from typer.testing import CliRunner
 
 import thincam_jax as tc
+from thincam_jax import waveguide as wg
 from thincam_jax.commands import cli
 from thincam_jax.imaging.defects import stuck, wrapped
 from thincam_jax.lensless.resolve import SamplingWarning
@@ -213,3 +214,41 @@ def test_a_filter_of_two_planes():
     with pytest.raises(ValueError, match="several planes, which a filter does not separate"):
         tc.reconstruct(recording, "wiener")
     tc.reconstruct(recording, tc.AdmmTV(iterations=2))
+
+
+def test_a_number_of_a_part():
+    """The advice changes it."""
+    made = camera()
+    with pytest.raises(TypeError, match=r"has no beta; give mask=….mask.replace\(beta=…\)"):
+        made.replace(beta=9.0)
+    with pytest.raises(TypeError, match="has no distant; give distance"):
+        made.replace(distant=9.0)
+    assert float(made.replace(mask=made.mask.replace(beta=9.0)).mask.beta) == 9.0
+    with pytest.raises(AttributeError, match="did you mean FresnelZoneAperture"):
+        tc.FZA(25.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "wrong"),
+    [
+        ("hologram", {"wavelength": 532.0}),
+        ("hologram", {"thickness": 16.0}),
+        ("hologram", {"thickness": 16e-6}),
+        ("screen", {"glass_thickness": 5000.0}),
+        ("camera", {"focal_distance": 0.006}),
+        ("camera", {"focal_distance": 6000.0}),
+    ],
+)
+def test_a_screen_in_other_units(part, wrong):
+    def made(**changed):
+        film = {"wavelength": 532 * nm, "thickness": 16 * um} | changed.get("hologram", {})
+        angles = {"object_angle": 0.0, "reference_angle": 1.07}
+        hologram = wg.VolumeHologram.record(**angles, **film, index=1.5, index_modulation=0.02)
+        glass = {"glass_thickness": 5.0} | changed.get("screen", {})
+        screen = wg.Screen(hologram=hologram, **glass, glass_index=1.5)
+        lens = {"focal_distance": 6.0, "lens_distance": 10.0} | changed.get("camera", {})
+        return wg.SeeThroughCamera(screen, tc.Sensor((44, 48), 48 * um), **lens)
+
+    made()
+    with pytest.raises(ValueError, match=r"give it in mm|in mm$| mm$"):
+        made(**{part: wrong})

@@ -64,8 +64,7 @@ class Module(AnyRank):
         names = list(inspect.signature(type(self)).parameters)
         for name in changes:
             if name not in names:
-                near = nearest(name, names) or names
-                raise TypeError(f"{type(self).__name__} has no {name}; give {', '.join(near)}")
+                raise TypeError(f"{type(self).__name__} has no {name}; give {_near(self, name)}")
         kept = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return type(self)(**kept | changes)
 
@@ -79,6 +78,16 @@ class Module(AnyRank):
         ]
         name = wl.TextDoc(f"{type(self).__name__}(")
         return wl.bracketed(name, parts, wl.comma, wl.TextDoc(")"), kwargs["indent"])
+
+
+def _near(made: Any, name: str) -> str:
+    """What to give in place of an argument that is unknown; it may be that of a part."""
+    names = list(inspect.signature(type(made)).parameters)
+    for part in names:
+        whole = getattr(made, part, None)
+        if isinstance(whole, Module) and name in inspect.signature(type(whole)).parameters:
+            return f"{part}=….{part}.replace({name}=…)"
+    return ", ".join(nearest(name, names) or names)
 
 
 def _shown(converter: Any, value: Any) -> Any:

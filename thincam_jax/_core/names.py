@@ -44,9 +44,14 @@ def modules_of(package: str, names: Callable[[str], Any] | None = None) -> Any:
             return names(name)
         if not name.startswith("_") and importlib.util.find_spec(path):
             return importlib.import_module(path)
-        near = [one for one in known if one.startswith(name)]
-        near = (near or nearest(name, known))[:3]
+        near = [one for one in known if one.startswith(name) or _initials(one) == name.upper()]
+        near = (near or nearest(name, [one for one in known if not one.startswith("_")]))[:3]
         hint = f": did you mean {' or '.join(near)}?" if near else ""
         raise AttributeError(f"{package} has no name {name}{hint}", name=name)
 
     return attribute
+
+
+def _initials(name: str) -> str:
+    """Capitals of a name, such as FZA of FresnelZoneAperture."""
+    return "".join(letter for letter in name if letter.isupper())

@@ -7,6 +7,7 @@ surface with the top hologram a glass thickness w further, and objects d2 before
 """
 
 import functools
+import math
 from typing import Any
 
 import equinox as eqx
@@ -37,6 +38,10 @@ class Rectangle(Module):
         return (abs(points - self.centre) <= self.size / 2).all(axis=-1)
 
 
+# Widths of the sensor from it to the lens: what must be m or µm is refused.
+_NEAREST, _FURTHEST = 0.03, 1000.0
+
+
 class Screen(Module):
     """A plane-parallel glass plate with the same hologram at the top and at the bottom.
 
@@ -52,7 +57,9 @@ class Screen(Module):
             checks.instance, "hologram", VolumeHologram, "a waveguide.VolumeHologram"
         )
     )
-    glass_thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    glass_thickness: Float[Array, ""] = eqx.field(
+        converter=quantity("mm", positive=True, most=100.0)
+    )
     glass_index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     top: Rectangle | None = None
     bottom: Rectangle | None = None
@@ -96,6 +103,16 @@ class SeeThroughCamera(Module):
         default=0.0, converter=quantity("mm", non_negative=True)
     )
     lens_point: Float[Array, "2"] = eqx.field(default=None, converter=_two("mm"))
+
+    def __check_init__(self):
+        if checks.holds_traced((self.focal_distance, self.sensor)):
+            return
+        focal, wide = float(self.focal_distance), self.sensor.shape[1] * float(self.sensor.pitch)
+        if not _NEAREST * wide < focal < _FURTHEST * wide:
+            raise ValueError(
+                f"focal_distance = {focal:g} mm: a sensor {wide:.3g} mm wide sees "
+                f"{2 * math.degrees(math.atan(wide / 2 / focal)):.3g}°; give lengths in mm"
+            )
 
     @property
     def plate_axes(self) -> Float[Array, "3 3"]:

@@ -42,6 +42,7 @@ def _acute(name: str, angle: Number) -> Float[Array, ""]:
 
 
 _ACUTE = quantity("rad", check=_acute)
+_FILM = quantity("mm", least=1e-4, most=10.0)  # what must be µm or m is refused
 _MODULATION = quantity(check=functools.partial(checks.between, unit="a ratio", least=0.0, most=0.5))
 
 
@@ -58,7 +59,7 @@ class VolumeHologram(Module):
 
     grating: Float[Array, "3"] = eqx.field(converter=quantity("rad/mm", shape=(3,)))
     index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
-    thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    thickness: Float[Array, ""] = eqx.field(converter=_FILM)
     index_modulation: Float[Array, ""] = eqx.field(converter=_MODULATION)
 
     @staticmethod
@@ -68,7 +69,7 @@ class VolumeHologram(Module):
         reference_angle: Annotated[Number, _ACUTE],
         *,
         index: Annotated[AbstractIndex | Number, quantity(check=as_index)],
-        thickness: Annotated[Number, quantity("mm", positive=True)],
+        thickness: Annotated[Number, _FILM],
         index_modulation: Annotated[Number, _MODULATION],
     ) -> "VolumeHologram":
         """The reflection hologram that two plane waves in the plane x = 0 record.
@@ -81,7 +82,7 @@ class VolumeHologram(Module):
           `processed` for the changes by development.
         - `index_modulation`: Δn.
         """
-        laser = checks.positive("wavelength", wavelength, "mm")
+        laser = checks.wavelength("wavelength", wavelength)
         film = as_index("index", index)
         toward = _acute("object_angle", object_angle)
         reference = _acute("reference_angle", reference_angle)
