@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 
 import thincam_jax as tc
 from helpers import finite_difference, recipe, relative_l2
@@ -44,8 +44,7 @@ def test_a_kind_of_experiment_is_run_explained_and_checked(tmp_path, monkeypatch
     exec(recipe("a kind of experiment file"), module.__dict__)
     path, out = tmp_path / "seen.yaml", tmp_path / "out"
     path.write_text(CONTRAST, "utf-8")
-    shown = call("run", path, "--out", out)
-    assert shown.exit_code == 0, shown.output
+    shown = called("run", path, "--out", out)
     assert re.search(r"chart\W+0\.\d{3}\W+star\W+0\.\d{3}", shown.stdout)
     assert (out / "report.html").exists() and (out / "metrics.json").exists()
     said = call("explain", path).stdout

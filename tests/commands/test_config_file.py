@@ -50,11 +50,6 @@ class TestYaml:
         with pytest.raises(ConfigError, match="--set title: holds .* entries .an alias counts"):
             read_value("{" + ", ".join(rows) + "}", "--set title")
 
-    def test_too_many_entries_without_an_alias(self, monkeypatch):
-        monkeypatch.setattr("thincam_jax.commands.config_file._MOST_ENTRIES", 3)
-        with pytest.raises(ConfigError, match="^--set a: holds 4 entries .* at most 3 are read"):
-            read_value("[1, 2, 3]", "--set a")
-
     @pytest.mark.parametrize(
         "number", ["0x" + "f" * 5000, "9" * 5000, "0b" + "1" * 20_000, "1:" * 3000 + "1"]
     )
@@ -74,15 +69,7 @@ class TestYaml:
         config = load(tmp_path, changed("full_well: 13500", "full_well: 1e4"))
         assert config.sensor.full_well == 1e4
 
-    @pytest.mark.parametrize(
-        ("broken", "line"),
-        [
-            ("pitch: [40", "(9|10)"),
-            ("\tpitch: 40 um", "9"),
-            ("pitch: 'a", r"\d+"),
-            ("a: b: c", "9"),
-        ],
-    )
+    @pytest.mark.parametrize(("broken", "line"), [("pitch: [40", "(9|10)"), ("a: b: c", "9")])
     def test_invalid(self, broken, line, tmp_path):
         (found,) = faults(tmp_path, changed("  pitch: 40 um", f"  {broken}"))
         assert re.match(rf"{line}: not valid YAML: \w+", found)
@@ -151,16 +138,14 @@ class TestOverrides:
         [
             ("sensor.pitch=5", "sensor.pitch", "5 has no unit"),
             ("mask.widht=2 mm", "mask.widht", "unknown key; allowed here: width, profile"),
-            ("noise={snr: 30}", "noise.snr", "unknown key; allowed here: snr_db"),
             ("seed=", "seed", "null: input should be a valid integer"),
-            ("seed=None", "seed", "for none write null"),
             ("noise.snr_db=none", "noise.snr_db", "for none write null"),
             ("noise=", "methods[1].kind", "give a 'noise' section"),
         ],
     )
     def test_fault_names_the_override(self, override, field, part, tmp_path):
         lines = faults(tmp_path, BASE, override)
-        line = lines[-1] if override == "noise={snr: 30}" else lines[0]
+        line = lines[0]
         place = "--set " + override
         if override == "noise=":  # what lacks the noise is in the file
             place = str(line_of(BASE, "kind: wiener"))
@@ -177,12 +162,8 @@ class TestOverrides:
         [
             ("targets.2.name=x", "targets has no entry 2"),
             ("targets.first.name=x", "targets has no entry 'first'"),
-            ("targets.-1.name=x", "targets has no entry '-1'"),
-            ("targets.².name=x", "targets has no entry '²'"),
-            ("seed.a=5", "seed has no entry 'a'"),
             ("sensor.shape.2=5", "sensor.shape has no entry 2"),
             ("title=[a", "'[a' is not valid YAML; put texts in quotes"),
-            ("title=2020-13-45", "'2020-13-45' is not valid YAML; put texts in quotes"),
         ],
     )
     def test_no_such_place_or_value(self, override, part, tmp_path):

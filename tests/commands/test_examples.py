@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import unquote, urljoin, urlsplit
 
 import pytest
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 
 from helpers import ROOT
 from thincam_jax.commands import kinds
@@ -18,8 +18,7 @@ FILES = sorted((ROOT / "configs").glob("*.yaml"))
 def test_every_shipped_file_is_one_that_its_command_takes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for kind in kinds.examples():
-        result = call("init", kind)
-        assert result.exit_code == 0, result.output
+        result = called("init", kind)
         command = kinds.read_kind(tmp_path / f"{kind}.yaml").command
         assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
         load_experiment(tmp_path / f"{kind}.yaml", command=command)

@@ -6,7 +6,7 @@ import klayout.db
 import numpy as np
 import pytest
 from commands.study import tiny
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 
 import thincam_jax as tc
 from thincam_jax.lensless.masks.halftone import halftone
@@ -24,8 +24,7 @@ def test_cells_are_those_of_the_mask_and_their_psf_is_found(file, density, tmp_p
     """The PSF's error against one computed here, on the sensor of the file."""
     out = tmp_path / "plate.gds"
     options = ("--halftone", f"10 um, {density}", "--shot", "1", "--json")
-    result = call("plate", file, "--out", out, *options)
-    assert result.exit_code == 0, result.output
+    result = called("plate", file, "--out", out, *options)
     found = {}
     for line in result.stdout.splitlines():
         found |= json.loads(line)
@@ -49,8 +48,7 @@ def test_cells_are_those_of_the_mask_and_their_psf_is_found(file, density, tmp_p
 
 
 def test_a_grey_table(file, tmp_path):
-    result = call("plate", file, "--out", tmp_path / "plate.tif", "--pixel", "10 um")
-    assert result.exit_code == 0, result.output
+    called("plate", file, "--out", tmp_path / "plate.tif", "--pixel", "10 um")
     record = json.loads((tmp_path / "plate.json").read_text("utf-8"))
     assert record["shape"] == [200, 200] and record["pixel_mm"] == pytest.approx(0.01)
 

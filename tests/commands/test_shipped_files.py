@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import yaml
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 from jsonschema import Draft202012Validator
 
 from helpers import ROOT
@@ -51,8 +51,7 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
 @pytest.mark.parametrize("kind", KINDS)
 def test_schemas_of_the_shipped_files_are_those_of_the_command(kind):
     """Refreshed by `thincam schema KIND > configs/schemas/KIND.json`."""
-    result = call("schema", kind)
-    assert result.exit_code == 0, result.output
+    result = called("schema", kind)
     assert (SCHEMAS / f"{kind}.json").read_text("utf-8") == result.stdout
     Draft202012Validator.check_schema(json.loads(result.stdout))
 
@@ -92,8 +91,7 @@ STS = ("stis", "sts_calibration", "sts_colours")
 @but(*DESIGNS, *STUDIES, *RIGS, *FZA, *STS, "mosaic")
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", options_of(path, tmp_path)
-    result = call(read_kind(path).command, path, "--out", out, "--dry-run", *options)
-    assert result.exit_code == 0, result.output
+    result = called(read_kind(path).command, path, "--out", out, "--dry-run", *options)
     *computed, written, end = result.stdout.splitlines()
     assert len(computed) >= 1 and all(re.search("[0-9]", line) for line in computed)
     assert written.startswith(f"writes to {out}: ")
@@ -122,8 +120,7 @@ def with_units(data):
 class TestExplain:
     def test_places(self):
         path = ROOT / "configs/quick.yaml"
-        result = call("explain", path, "--set", "noise.snr_db=40")
-        assert result.exit_code == 0, result.output
+        result = called("explain", path, "--set", "noise.snr_db=40")
         rows = dict(re.split(r" +# ", line) for line in result.stdout.splitlines() if "#" in line)
         given = path.read_text("utf-8").splitlines()
         line = next(n for n, text in enumerate(given, 1) if text.startswith("  pitch: 11 um"))
@@ -133,8 +130,7 @@ class TestExplain:
 
     @but("design_slm", "design_distances", *STUDIES, *RIGS, "mosaic", "fza_superresolution")
     def test_every_file(self, path, tmp_path):
-        result = call("explain", path, *options_of(path, tmp_path))
-        assert result.exit_code == 0, result.output
+        result = called("explain", path, *options_of(path, tmp_path))
         *values, work = result.stdout.splitlines()
         assert f"name: {load_experiment(path, command=None).name}" in values[0]
         assert re.search("operations$|frames|batches$|entries|seeds$", work)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from commands.study import tiny
 from commands.sweep import mini
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 
 from thincam_jax._core.table import Table
 from thincam_jax._core.text import escaped
@@ -50,8 +50,7 @@ def test_an_error_shows_no_control_characters(changed, tmp_path):
 
 
 def test_what_is_printed_shows_no_control_characters(tmp_path, capsys):
-    result = call("init", "study", "--out", tmp_path / f"{EVIL.replace('/', '')}.yaml")
-    assert result.exit_code == 0
+    result = called("init", "study", "--out", tmp_path / f"{EVIL.replace('/', '')}.yaml")
     require_plain(result.stdout)
     terminal.warn([EVIL])
     terminal.show(Table((EVIL,), ((EVIL,),), title=EVIL))
@@ -100,8 +99,7 @@ def test_a_long_value_is_cut(entry, tmp_path):
 def test_results_as_json(tmp_path):
     """An object in a line, and nothing else; the table holds the numbers that are not rounded."""
     file = mini.write(tmp_path)
-    result = call("run", file, "--out", tmp_path / "out", "--json")
-    assert result.exit_code == 0, result.output
+    result = called("run", file, "--out", tmp_path / "out", "--json")
     table, report = (json.loads(line) for line in result.stdout.splitlines())
     assert table["table"]["headings"][0] == "method" and table["table"]["rows"][0][0] == "single"
     assert table["table"]["rows"][0][-1] == pytest.approx(25 / math.pi, rel=0.005)  # βR/π

@@ -6,7 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 
 from thincam_jax.hardware import registry
 from thincam_jax.hardware.base import Busy, Connected, Device, NotFound
@@ -92,8 +92,7 @@ def test_a_driver_of_another_package_finds_its_own(monkeypatch):
     monkeypatch.setattr(registry, "driver", lambda kind, name: Eye)
     ports = [SimpleNamespace(device="/dev/ttyUSB0", description="USB serial")]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
-    result = call("doctor", "--devices")
-    assert result.exit_code == 0, result.output
+    result = called("doctor", "--devices")
     lines = result.stdout.splitlines()
     assert "camera eye {serial: 7}: Elsewhere Eye" in lines
     assert "serial port {port: /dev/ttyUSB0}: USB serial" in lines

@@ -1,6 +1,8 @@
 """Files of kind design: what they mean, and one line for each fault."""
 
+import numpy as np
 import pytest
+import skimage.io
 from commands.design import tiny
 
 from helpers import rows
@@ -62,27 +64,20 @@ def test_fringe_scanning_takes_four_captures_a_shot(tmp_path):
 
 FAULTS = """
 search.free.0.bounds=[9 /mm^2, 8 /mm^2] | search.free[0].bounds | bounds cross: 9 to 8
-search.free.0.bounds=[9 /mm^2, 9 /mm^2] | search.free[0].bounds | bounds cross: 9 to 9
-search.free.0.bounds=8 /mm^2 | search.free[0].bounds | give [lowest, highest]
 search.free.0={variable: width, bounds: [1 mm, 2 mm], shots: [1]} | search.free[0] | share the width
 search.free.0={variable: exposure, bounds: [0.5, 1.5]} | search.free | noise that counts electrons
 search.free.0={variable: exposure, bounds: [0.5 s, 1.5]} | search.free[0].bounds | give parts of
 search.free.0={variable: wavelength, bounds: [5 um, 2 mm]} | search.free[0].bounds | 10 nm to 0.1 mm
-search.free.0.shots=[1, 1] | search.free[0].shots | holds an entry twice
 reference.shots.1.beta=25 /mm^2 | reference.shots | hold an entry twice
 reference.shots.1.wavelength=600 nm | reference.shots[1].wavelength | whole file
 reference.shots.0.width=1 mm | reference.shots[0].width | whole file; drop this one
-reference.shots.0.exposure=2 | reference.shots[0].exposure | whole file
 reference.name=Found 1 | reference.name | is what another or a found design is called
 search.band=[0.1, 0.4] | search | objective bayes_error has no band
 noise.read_noise=8 | noise | give either snr_db
 prior.measured=true | prior | give either exponent
 search.objective=robust_error | search | robust_error and tolerances belong together
-search.tolerances={distance: 20 um} | search | belong together; give both
 search.tolerances={how: worst} | search.tolerances | give at least one, such as
 train={images: [nobody]} | train.images | 'nobody' is no image; choose one of astronaut,
-train={images: [camera, camera]} | train.images | holds an entry twice
-compare=[{name: other, shots: [SHOT]}] | compare[0].shots | 1 shots, and the reference has 2
 compare=[{name: pairs, shots: [SHOT, {beta: 8 /mm^2, distance: 3 mm}]}] | compare[0].name | another
 pareto={} | pareto | no front is requested; give thickness, captures or light
 FREE & pareto.thickness.bounds=[4 mm, 3 mm] | pareto.thickness.bounds | bounds cross: 4 to 3 mm
@@ -90,9 +85,7 @@ pareto.thickness.bounds=[3 mm, 4 mm] | pareto.thickness | no distance is free
 FREE & pareto.thickness.bounds=[2 mm, 4 mm] | pareto.thickness.bounds | distance of capture 1 ≥ 3 mm
 FREE & pareto.thickness.bounds=[3 mm, 5 mm] | pareto.thickness.bounds | no free distance beyond 4 mm
 pareto.light.bounds=[9, 90] | pareto.light | light needs noise that counts electr
-pareto.light.bounds=[90, 9] | pareto.light.bounds | bounds cross: 90 to 9 electrons
 pareto.captures.shots=[1, 3] | pareto.captures.shots | 3 shots take 6 captures
-pareto.captures.shots=[1, 1] | pareto.captures.shots | holds an entry twice
 search.free.0.shots=[2] & pareto.captures.shots=[1, 2] | pareto.captures.shots | nothing is free
 CHART & pareto.captures.shots=[1] | pareto.captures | PSNR needs a photograph among the targets
 CHART & prior={measured: true} | prior.measured | measured needs a photograph
@@ -140,6 +133,13 @@ def test_no_feasible_design(tmp_path, setting, place, part):
     assert part in line
 
 
+def test_a_picture_too_small_to_measure(tmp_path):
+    image = np.arange(20 * 40, dtype=np.uint8).reshape(20, 40)
+    skimage.io.imsave(tmp_path / "small.png", image, check_contrast=False)
+    with pytest.raises(ConfigError, match=r"targets\[1\]: 20×40 pixels are too few to measure a"):
+        tiny.built(tmp_path, "prior={measured: true}", "targets.1.path=small.png")
+
+
 def test_fronts_and_their_costs(tmp_path):
     fronts = tiny.design(
         tmp_path,
@@ -157,9 +157,3 @@ def test_fronts_and_their_costs(tmp_path):
     path.write_text(dump_config(fronts), encoding="utf-8")
     assert tiny.load(path) == fronts
     assert tiny.design(tmp_path).pareto is None
-
-
-def test_more_captures_than_a_design_may_have(tmp_path):
-    shots = ", ".join(f"{{beta: {b} /mm^2, distance: 3 mm}}" for b in range(20, 25))
-    line = fault(tmp_path, f"reference.shots=[{shots}]")
-    assert ": reference.shots: a design of 10 captures; give 1 to 8" in line

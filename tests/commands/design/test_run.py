@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands.design import tiny
 from commands.study.tiny import Told
-from commands.test_cli import call
+from commands.test_cli import called
 
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
@@ -36,8 +36,7 @@ def whole(tmp_path_factory):
     """One uninterrupted run of the command: its folder, its record, and what it printed."""
     home = tmp_path_factory.mktemp("design")
     settings = [word for setting in QUICK for word in ("--set", setting)]
-    result = call("design", tiny.write(home), "--out", home / "out", *settings)
-    assert result.exit_code == 0, result.output
+    result = called("design", tiny.write(home), "--out", home / "out", *settings)
     return home / "out", stored(home / "out"), result.stdout
 
 

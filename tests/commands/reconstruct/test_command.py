@@ -256,25 +256,18 @@ class TestExitCode2:
     @pytest.mark.parametrize(
         ("more", "message"),
         [
-            (("--downsample", 0), "downsample = 0: give a whole number of at least 1"),
             (("--downsample", 100), "downsample = 100 is larger than the image of 60×76 pixels"),
             (("--method", "magic"), "method = 'magic' is unknown; choose one of 'auto'"),
             (("--method", "wiener"), "method 'wiener' needs a model of the camera"),
             (("--method", "poisson"), "method 'poisson' needs raw counts"),
             (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave it out"),
-            (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
-            (("--method", "pnp", "--tau", 2), "method 'pnp' cannot use tau; leave it out, or use"),
             (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave it out, or use 'ridge'"),
             (("--tau", 1e30), "tau = 1e+30: give about 1 to 3, at most 1e+06"),
-            (("--iterations", 0), "iterations = 0: give at least 1"),
             (("--bits", 8), "above the 255 of 8 bit"),
-            (("--background", "none.tif"), "none.tif: does not exist"),
             (("--background", 5000), "is black"),
             (("--dead", "none.png"), "none.png: does not exist"),
             (("--coupling", "opponent"), "has 1 channels and coupling 'opponent' is for 3"),
-            (("--white-balance", "1,2"), "--white-balance 1,2: give grey-world, or the gains"),
             (("--white-balance", "1,2,3"), "for 1 channel(s)"),
-            (("--gamma", 0), "give a gamma above 0"),
             (("--bayer", "RGGB", "--demosaic", "bilinear", "--capture", "none.tif"), "not exist"),
         ],
     )
@@ -288,9 +281,7 @@ class TestExitCode2:
     @pytest.mark.parametrize(
         ("which", "change", "message"),
         [
-            ("psf", "missing", "psf.tif: does not exist"),
             ("capture", "missing", "capture.tif: does not exist"),
-            ("psf", "cut", "psf.tif: is cut short"),
             ("capture", "cut", "capture.tif: is cut short"),
             ("psf", "text", "psf.tif: is not an image that can be read"),
             ("psf", "smaller", "60×70 pixels and the capture"),
@@ -319,7 +310,6 @@ class TestExitCode2:
         [
             ("psf.tif/image.png", "psf.tif: is no folder; give another"),
             ("image.jpg", "give one of these suffixes"),
-            ("image", "give one of these suffixes"),
             ("psf.tif", "psf.tif: is read as an input and would be overwritten"),
             ("/proc/image.png", "/proc: cannot be written into"),
         ],

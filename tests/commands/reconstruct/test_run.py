@@ -2,13 +2,12 @@
 
 import json
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands.reconstruct import simulated
 
-from helpers import full_disk, relative_l2
+from helpers import compilations, full_disk, relative_l2
 from thincam_jax._core import memory
 from thincam_jax.commands.reconstruct import jobs, run
 from thincam_jax.commands.reconstruct.jobs import plan_jobs
@@ -33,35 +32,18 @@ def sources(folder, **more):
     return Sources(folder / "psf.tif", folder / "dark.tif", bits=12, **more)
 
 
-@pytest.fixture
-def compilations():
-    """The durations of all compilations so far."""
-    seen = []
-
-    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            seen.append(duration_secs)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
-def test_folder_is_compiled_once(folder, tmp_path, compilations):
+def test_folder_is_compiled_once(folder, tmp_path):
     """For captures of other brightness and another mask of valid pixels too."""
     bright = np.asarray(simulated.counts(simulated.psf(), seed=9, full=4300), dtype=np.uint16)
     np.save(folder / "second.npy", bright)
     (folder / "second.tif").unlink()
     output = Output(tmp_path / "out", linear="none")
-    counts, shares = [], []
     planned = plan_jobs(folder, sources(folder), output)
-    for result in run_jobs(planned, sources(folder), SHORT, output):
-        assert isinstance(result, Finished)
-        counts.append(len(compilations))
-        shares.append(result.record["preparation"]["valid_share"])
-    # None at all where another test has compiled for these sizes before.
-    assert len(counts) == 3 and counts[1] == counts[2] == counts[0]
-    assert shares[0] == shares[2] == 1 and shares[1] < 1
+    results = run_jobs(planned, sources(folder), SHORT, output)
+    done = [next(results)]
+    assert compilations(lambda: done.extend(results)) == 0
+    shares = [one.record["preparation"]["valid_share"] for one in done if isinstance(one, Finished)]
+    assert len(shares) == 3 and shares[0] == shares[2] == 1 and shares[1] < 1
     assert sorted(p.stem for p in (tmp_path / "out").glob("*.png")) == ["first", "second", "third"]
 
 
@@ -143,9 +125,7 @@ class TestPlan:
         ("out", "message"),
         [
             ("captures", "holds the captures"),
-            ("captures/../captures", "holds the captures"),
             ("file.png", "is a file; for a folder of captures give a folder"),
-            ("file.png/out", "file.png: is no folder; give another"),
         ],
     )
     def test_output_of_a_folder(self, folder, tmp_path, out, message):
@@ -158,11 +138,6 @@ class TestPlan:
         (folder / "second.png").write_bytes(b"")
         with pytest.raises(MeasurementError, match=r"second.tif and second.png would both become"):
             plan_jobs(folder, sources(folder), Output(tmp_path / "out"))
-
-    def test_empty_folder(self, folder, tmp_path):
-        (tmp_path / "empty").mkdir()
-        with pytest.raises(MeasurementError, match="holds no capture"):
-            plan_jobs(tmp_path / "empty", sources(folder), Output(tmp_path / "out"))
 
     def test_output_beside_that_is_taken(self, folder, tmp_path):
         """By an input, or by a folder."""

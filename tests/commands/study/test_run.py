@@ -164,9 +164,7 @@ def test_captures_that_methods_share_are_taken_once(whole, taken):
     assert len({image for _, _, image in taken}) == len(taken)  # each has noise of its own
 
 
-@pytest.mark.parametrize(
-    "text", ["[]", "5", "NaN", '{"metrics": NaN}', "{}", '{"metrics": 1e999}', '{"a": "\\ud800"}']
-)
+@pytest.mark.parametrize("text", ["5", '{"metrics": NaN}', "{}", '{"a": "\\ud800"}'])
 def test_damaged_result_of_a_target_is_done_again(home, whole, text):
     folder = RunFolder(home / "damaged")
     folder.claim(whole[0].config)
@@ -209,12 +207,6 @@ class TestInputs:
         with double_precision(not is_double()):
             assert folder.changed(config) == ["precision"]
 
-    def test_a_folder_without_a_record_of_them(self, tmp_path):
-        folder, config = self.claimed(tmp_path)
-        (folder.path / "inputs.json").write_text("5", encoding="utf-8")
-        folder.claim(config)
-        assert folder.finished("chart") is None
-
     def test_all_files_of_a_folder_count(self, tmp_path):
         (tmp_path / "images").mkdir()
         (tmp_path / "images" / "a.png").write_bytes(b"a")
@@ -247,14 +239,6 @@ def test_folder_with_other_files_is_refused_untouched(home, whole):
     assert all(p.read_text("utf-8") == "mine" for p in before if p.is_file())
 
 
-def test_folder_whose_configuration_is_no_text_is_refused(home, whole):
-    folder = RunFolder(home / "binary")
-    folder.path.mkdir()
-    (folder.path / "config.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="another configuration"):
-        folder.claim(whole[0].config)
-
-
 class TestCheck:
     """Faults that are found before the first capture: one line each, which names the field."""
 
@@ -281,7 +265,7 @@ class TestCheck:
         skimage.io.imsave(tmp_path / "picture.png", black, check_contrast=False)
         assert "targets[1]: the image is uniform" in self.line(config)
 
-    @pytest.mark.parametrize("shape", ["[1, 1]", "[1, 64]", "[6, 64]", "[48, 1]", "[48, 41]"])
+    @pytest.mark.parametrize("shape", ["[6, 64]", "[48, 41]"])
     def test_sensor_of_too_few_pixels(self, shape, tmp_path):
         line = self.line(tiny.study(tmp_path, f"sensor.shape={shape}"))
         assert "sensor.shape: " in line

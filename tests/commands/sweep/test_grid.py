@@ -36,19 +36,14 @@ def fault(*texts):
     ("text", "expected"),
     [
         ("seed=0:4:5", (0, 1, 2, 3, 4)),
-        ("seed=4:0:3", (4, 2, 0)),
-        ("seed=5:5:1", (5,)),
         ("seed=5:8:1", (5,)),
         ("noise.snr_db=0:1:3", (0, 0.5, 1)),
         ("noise.snr_db=.1:.3:3", (0.1, 0.2, 0.3)),
         ("noise.snr_db=-10:10:3", (-10, 0, 10)),
         ("noise.snr_db=1e-3:1:4:log", (0.001, 0.01, 0.1, 1)),
         ("mask.width=1:2:3mm", ("1 mm", "1.5 mm", "2 mm")),
-        ("mask.width = 1 : 2 : 3 mm", ("1 mm", "1.5 mm", "2 mm")),
         ("wavelength=1:100:3:log um", ("1 um", "10 um", "100 um")),
         ("methods.0.shots.0.beta=15:30:2 rad/mm^2", ("15 rad/mm^2", "30 rad/mm^2")),
-        ("methods.0.shots.0.beta=15:30:2 /mm^2", ("15 /mm^2", "30 /mm^2")),
-        ("seed=3", (3,)),
         ("seed=1,5", (1, 5)),
         ("mask.width=2 mm", ("2 mm",)),
         ("mask.width=1 mm, 15 um", ("1 mm", "15 um")),
@@ -109,15 +104,10 @@ NINES = "9," * 99
     ("text", "part"),
     [
         ("seed", "write it as path=lo:hi:n"),
-        ("=0:1:2", "write it as path=lo:hi:n"),
         ("a..b=0:1:2", "write it as path=lo:hi:n"),
         ("seed=", "has no values"),
-        ("seed= ", "has no values"),
         ("seed=0:4", "write it as path=lo:hi:n"),
-        ("seed=0:4:x", "write it as path=lo:hi:n"),
         ("seed=0:4:5:6", "write it as path=lo:hi:n"),
-        ("seed=0:4:2.5", "write it as path=lo:hi:n"),
-        ("seed=0:4:0", "n is 0; give from 1 to 100000"),
         ("seed=0:4:1000000000", "n is 1000000000; give from 1"),
         ("seed=0:4:3:log", "log needs both ends above zero"),
         ("mask.width=1 mm:2 mm:3", "a unit stands once, at the end"),
@@ -125,9 +115,7 @@ NINES = "9," * 99
         # Counted as in files.
         (f"seed=&a [{NINES}],&b [{'*a,' * 99}],[{'*b,' * 99}]", "entries (an alias counts as"),
         ("mask.*=1", "mask is no list"),
-        ("*=1", "the file is no list"),
         ("methods.5.shots.*.beta=1", "methods.5.shots is no list"),
-        ("nowhere.*.beta=1", "nowhere is no list"),
     ],
 )
 def test_refused(text, part):
@@ -139,7 +127,6 @@ def test_refused(text, part):
 @pytest.mark.parametrize(
     ("first", "second", "entry"),
     [
-        ("seed=1", "seed=2", "seed"),
         ("methods.0.shots.1.beta=1", "methods.*.shots.*.beta=2", "methods.0.shots.1.beta"),
         ("noise.snr_db=1", "noise={snr_db: 3}", "noise"),
         ("mask={width: 1 mm}", "mask.width=1 mm", "mask.width"),

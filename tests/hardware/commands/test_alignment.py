@@ -7,7 +7,7 @@ import PIL.Image
 import pytest
 import scipy
 import yaml
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 from hardware.commands import tiny
 
 from thincam_jax.commands.checked_config import load_as
@@ -50,8 +50,7 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
     """To a tenth of a pixel of the display; pictures are seen where the model has them."""
     store, out = file.with_name("a.zarr"), file.with_name("out")
     for args in (("capture", file, "--out", store), ("run", store, "--out", out)):
-        result = call(*args)
-        assert result.exit_code == 0, result.output
+        called(*args)
     found = Alignment.load(out / "alignment.json")
     assert found.used == 9
     angles = {"rotation": 3 * deg, "turn": 6 * deg}
@@ -63,8 +62,7 @@ def test_the_monitor_is_found_and_pictures_are_shown_in_place(file):
     assert "9 of 9 marks lie within" in (out / "report.html").read_text("utf-8")
     store, placed = file.with_name("b.zarr"), out / "alignment.json"
     for args in (("capture", file, "--out", store, *pictures(placed)), ("run", store)):
-        result = call(*args, *(() if args[0] == "capture" else ("--out", file.with_name("b"))))
-        assert result.exit_code == 0, result.output
+        called(*args, *(() if args[0] == "capture" else ("--out", file.with_name("b"))))
     config = load_as(CaptureConfig, store / "config.yaml")
     (levels,) = picture_levels(config).values()
     (target,), to_cells = config.targets, np.diag([1 / 2.5, 1 / 2.5, 1.0])
@@ -99,8 +97,7 @@ def test_photographs_become_pairs_of_captures_and_truths(aligned):
     store, out = aligned / "p.zarr", aligned / "out"
     asked = [part for one in sets for part in ("--set", one)]
     for args in (("capture", file, "--out", store, *asked), ("run", store, "--out", out)):
-        result = call(*args)
-        assert result.exit_code == 0, result.output
+        called(*args)
     assert "2 pairs; next: thincam evaluate" in (out / "report.html").read_text("utf-8")
     pairs = open_pairs(out / "pairs")
     assert list(pairs.names) == ["chelsea", "coins"] and pairs.licence == "own (README.md)"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from commands.pages import assert_says_its_result
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 from hardware.commands import tiny
 
 from helpers import quick, read_fiducial, recipe
@@ -33,8 +33,7 @@ def method_b(tmp_path_factory):
     """The file and the store of a capture, taken once."""
     folder = tmp_path_factory.mktemp("rig")
     file = tiny.write(folder)
-    result = call("capture", file, "--out", folder / "a.zarr")
-    assert result.exit_code == 0, result.output
+    result = called("capture", file, "--out", folder / "a.zarr")
     assert f"{folder / 'a.zarr'}: 6 frames; next: thincam run" in result.stdout.replace("\n", "")
     return file, folder / "a.zarr"
 
@@ -42,8 +41,7 @@ def method_b(tmp_path_factory):
 @pytest.mark.thorough
 def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
     """Frames and image, within the noise, by a model that the virtual rig does not use."""
-    result = call("run", method_b[1], "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.output
+    called("run", method_b[1], "--out", tmp_path / "out")
     found = json.loads((tmp_path / "out" / "metrics.json").read_text("utf-8"))
     agreement = found["agreement"]
     for residual, bias in zip(
@@ -65,10 +63,8 @@ def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
 def test_a_matrix_of_captures_agrees_with_direct_simulation(light, tmp_path):
     """With light of a display behind the plate by its shot noise, which is in no calibration."""
     file = tiny.write(tmp_path, tiny.HADAMARD + light)
-    result = call("capture", file, "--out", tmp_path / "a.zarr")
-    assert result.exit_code == 0, result.output
-    result = call("run", tmp_path / "a.zarr", "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.output
+    called("capture", file, "--out", tmp_path / "a.zarr")
+    called("run", tmp_path / "a.zarr", "--out", tmp_path / "out")
     found = json.loads((tmp_path / "out" / "metrics.json").read_text("utf-8"))
     assert found["frames"] == 2 * 8 * 16 + 2
     assert found["matrix"] == [28 * 40, 8 * 16]
@@ -95,8 +91,7 @@ def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, 
         raw["plan"] = {"kind": "method_a", "betas": ["60 rad/mm^2"], "width": "1.44 mm"}
         raw["plan"]["distances"] = ["6.5 mm", "8 mm"]
     file = tiny.write(tmp_path, yaml.safe_dump(raw))
-    result = call("capture", file, "--out", tmp_path / "a.zarr")
-    assert result.exit_code == 0, result.output
+    called("capture", file, "--out", tmp_path / "a.zarr")
     taken = Acquisition.load(tmp_path / "a.zarr")
     seen = set()
     for number, step in enumerate(taken.plan.steps):
@@ -113,8 +108,7 @@ def test_a_store_is_not_written_over_and_a_missing_one_begun(method_b, tmp_path)
     """As after a kill before the first frame, when the same line is typed with --resume."""
     file, store = method_b
     assert "exists; --resume goes on" in one_line(call("capture", file, "--out", store))
-    begun = call("capture", file, "--out", tmp_path / "b.zarr", "--resume")
-    assert begun.exit_code == 0, begun.output
+    called("capture", file, "--out", tmp_path / "b.zarr", "--resume")
     assert Acquisition.load(tmp_path / "b.zarr").plan == Acquisition.load(store).plan
     other = call("capture", file, "--out", store, "--resume", "--set", "plan.dark_frames=1")
     assert "another plan" in one_line(other)
@@ -190,8 +184,7 @@ def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch)
     assert late.endswith("aravis") == (find_spec("gi") is not None)
     sets = ("--set", "rig=real", "--set", "camera.driver=eye", "--set", "display.driver=screen")
     file = tiny.write(tmp_path)
-    result = call("capture", file, "--out", tmp_path / "a.zarr", *sets)
-    assert result.exit_code == 0, result.output
+    called("capture", file, "--out", tmp_path / "a.zarr", *sets)
     taken = Acquisition.load(tmp_path / "a.zarr")
     assert taken.provenance["devices"]["camera"]["vendor"] == "Elsewhere"
     assert taken.frame(taken.lit[0]).max() > 100

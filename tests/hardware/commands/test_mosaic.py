@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import yaml
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 from hardware.commands import tiny
 
 from thincam_jax.hardware.acquisition.read import Acquisition
@@ -30,8 +30,7 @@ def test_one_frame_holds_all_captures(wall, file, tmp_path):
     store, out = tmp_path / "a.zarr", tmp_path / "out"
     options = ["--set", f"plan.mosaic.wall={wall}", "--set", "virtual.electrons=500_000"]
     for args in (("capture", file, "--out", store, *options), ("run", store, "--out", out)):
-        result = call(*args)
-        assert result.exit_code == 0, result.output
+        called(*args)
     taken = Acquisition.load(store)
     (frame,) = taken.captures()
     assert [pattern.kind for pattern in taken.patterns] == ["mosaic"]
@@ -48,9 +47,7 @@ def test_one_frame_holds_all_captures(wall, file, tmp_path):
     ("asked", "line"),
     [
         ("plan.mosaic.columns=3", "plan.mosaic: 4 masks are shown; give as many rows × columns"),
-        ("plan.mosaic.pitch=null", "plan.mosaic: 4 masks are shown; give as many rows × columns"),
         ("plan.mosaic.pitch=1.02 mm", "give a width and a mosaic.pitch that are an even number"),
-        ("plan.mosaic.pitch=2.016 mm", "give a width and a mosaic.pitch that are an even number"),
         ("camera.region={top: 4, left: 8, height: 48, width: 80}", "camera.region: a mosaic has"),
         ("plan.kind=scene", "plan.mosaic: a plan of kind scene takes "),
     ],

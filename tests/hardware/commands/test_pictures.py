@@ -9,7 +9,7 @@ import pytest
 import skimage.io
 import yaml
 from commands.pages import assert_says_its_result
-from commands.test_cli import call, one_line
+from commands.test_cli import call, called, one_line
 from hardware.commands import tiny
 
 PICTURES = yaml.safe_load(tiny.HADAMARD) | {
@@ -35,8 +35,7 @@ def home(tmp_path_factory):
     skimage.io.imsave(folder / "bars.png", bars, check_contrast=False)
     for name, raw in (("calibration", yaml.safe_load(tiny.HADAMARD)), ("pictures", PICTURES)):
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(raw), "utf-8")
-        result = call("capture", f"{name}.yaml", "--out", f"{name}.zarr")
-        assert result.exit_code == 0, result.output
+        result = called("capture", f"{name}.yaml", "--out", f"{name}.zarr")
     assert "6 frames; next: thincam run" in result.stdout.replace("\n", "")
     yield folder
     os.chdir(before)
@@ -45,8 +44,7 @@ def home(tmp_path_factory):
 @pytest.mark.thorough
 def test_pictures_come_back(home):
     """By the captures of the calibration, and by the matrix that their own run made."""
-    result = call("run", "pictures.zarr", "--out", "found")
-    assert result.exit_code == 0, result.output
+    called("run", "pictures.zarr", "--out", "found")
     scores = json.loads((home / "found/metrics.json").read_text("utf-8"))["methods"]
     for method in ("CGM", "TV"):
         of_targets = scores[method]["targets"]
@@ -81,8 +79,7 @@ def test_dark_frames_subtract_the_light_of_a_display(home):
         (home / "lit.yaml").write_text(yaml.safe_dump(raw), "utf-8")
         store, out = f"lit-{darks}.zarr", f"lit-{darks}"
         for args in (("capture", "lit.yaml"), ("run", store)):
-            result = call(*args, "--out", store if args[0] == "capture" else out)
-            assert result.exit_code == 0, result.output
+            called(*args, "--out", store if args[0] == "capture" else out)
         found = json.loads((home / out / "metrics.json").read_text("utf-8"))["methods"]
         scores[darks] = found["CGM"]["mean_psnr_db"]
     assert scores[8] > 22 and scores[8] > scores[0] + 5, scores
@@ -114,8 +111,7 @@ def test_a_scene_comes_back_by_the_matrix(home):
     raw = PICTURES | {"name": "tiny-scene", "plan": plan, "targets": PICTURES["targets"][:1]}
     (home / "scene.yaml").write_text(yaml.safe_dump(raw), "utf-8")
     for args in (("capture", "scene.yaml", "--out", "scene.zarr"), ("run", "scene.zarr")):
-        result = call(*args, *(("--out", "seen") if args[0] == "run" else ()))
-        assert result.exit_code == 0, result.output
+        called(*args, *(("--out", "seen") if args[0] == "run" else ()))
     metrics = json.loads((home / "seen/metrics.json").read_text("utf-8"))["methods"]
     assert all(metrics[name]["targets"]["bars"]["psnr_db"] > 35 for name in ("CGM", "TV"))
     assert "reconstructs 1 picture at" in assert_says_its_result(home / "seen")
@@ -123,8 +119,7 @@ def test_a_scene_comes_back_by_the_matrix(home):
     text = (home / "scene.zarr/config.yaml").read_text("utf-8")
     real = text.replace("rig: virtual", "rig: real").replace("sdl", "shutter")
     (home / "real.zarr/config.yaml").write_text(real, "utf-8")
-    result = call("run", "real.zarr", "--out", "real")
-    assert result.exit_code == 0, result.output
+    called("run", "real.zarr", "--out", "real")
     scores = json.loads((home / "real/metrics.json").read_text("utf-8"))["methods"]["TV"]
     assert scores["mean_psnr_db"] is None and not scores["targets"]
     images = [

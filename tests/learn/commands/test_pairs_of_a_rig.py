@@ -12,7 +12,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import yaml
-from commands.test_cli import call
+from commands.test_cli import call, called
 from hardware.commands import tiny
 from hardware.commands.test_alignment import ALIGNMENT, PICTURES
 
@@ -67,8 +67,7 @@ def home(tmp_path_factory):
     rig["camera"]["exposure"] = "40 ms"
     rig["virtual"] |= {"monitor": {}, "display": [90, 100]}
     file = tiny.write(folder, yaml.safe_dump(rig))
-    done = call("capture", file, "--out", folder / "rig.zarr")
-    assert done.exit_code == 0, done.output
+    called("capture", file, "--out", folder / "rig.zarr")
     return folder
 
 
@@ -79,8 +78,7 @@ def train(file, out, *more):
 @pytest.mark.thorough
 def test_from_captures_to_a_network_that_is_scored_on_others(home):
     """By its commands alone; a training that was killed ends with the same network."""
-    done = call("run", home / "rig.zarr", "--out", home / "rig")
-    assert done.exit_code == 0, done.output
+    done = called("run", home / "rig.zarr", "--out", home / "rig")
     data, out = home / "rig/pairs", home / "whole"
     file = home / "tuned.yaml"
     named = {"psf": {"path": str(data / "psf.tif")}, "pairs": {"path": str(data), "judged": 2}}
@@ -125,8 +123,7 @@ def test_from_captures_to_a_network_that_is_scored_on_others(home):
         (home / name / NETWORK).rename(home / f"{name}.thincam")
         methods.append(str(home / f"{name}.thincam"))
     asked = [word for one in methods for word in ("--method", one)]
-    scored = call("evaluate", data, *asked, "--workers", 1, "--out", home / "scores")
-    assert scored.exit_code == 0, scored.output
+    called("evaluate", data, *asked, "--workers", 1, "--out", home / "scores")
     with open(home / "scores/table.csv", encoding="utf-8") as table:
         rows = list(csv.DictReader(table))
     assert {row["name"] for row in rows} == {"7", "8", "9"}
