@@ -226,18 +226,6 @@ def test_a_warm_start_is_given_upright_and_converges_sooner():
         assert turned.history[0].objective > 1.05 * lowest
 
 
-@pytest.mark.parametrize("kind", [tc.AdmmTV, tc.Fista, tc.Ridge, tc.PoissonTV])
-def test_when_to_end_is_checked_at_once(kind):
-    """Of every solver that has iterations."""
-    for settings, message in (
-        ({"iterations": 0}, "iterations = 0: give a whole number of at least 1"),
-        ({"iterations": True}, "iterations = True: give a whole number of at least 1"),
-        ({"iterations": 3.5}, "iterations = 3.5: give a whole number of at least 1"),
-        ({"tolerance": -1.0}, "tolerance = -1.0 is negative"),
-    ):
-        rig.refused(message, lambda s=settings: kind(**s))
-
-
 @pytest.mark.parametrize("kind", [tc.AdmmTV, tc.Fista])
 def test_what_is_out_of_range_is_refused(kind):
     for tau, message in ((-1.0, "tau = -1.0 is negative"), ("best", "choose one of 'disc")):

@@ -149,8 +149,8 @@ def test_light_that_fills_planes_keeps_its_low_frequencies_through_right_psfs():
             return tc.AdmmTV(iterations=iterations).minimise(problem, image, None, given=True)
 
         start = jnp.zeros(problem.image_shape)
-        first = minimise(start, 300, without_smooth_misfit(problem))
-        found = with_smooth_light(problem, first, minimise, 300)
+        first = minimise(start, 150, without_smooth_misfit(problem))
+        found = with_smooth_light(problem, first, minimise, 150)
         if recording is right:
             before, after = (
                 np.asarray(recording.reconstruction(one, "", 2.0).image) for one in (first, found)

@@ -289,21 +289,14 @@ def test_what_is_refused():
     other = rig.camera(sensor=tc.Sensor((96, 85), 24 * um))
     with pytest.raises(ValueError, match="different sensors.*use one sensor"):
         synthesis([near[0], other], separate(2))
-    with rig.unchecked(), pytest.raises(ValueError, match="prior = 'x'.*'inverse_square', 'flat'"):
-        synthesis(near, phase_pairs(1), prior="x")
     with pytest.raises(TypeError, match="distances are traced.*known numbers"):
         jax.jit(lambda d: synthesis(rig.pair(distance=d), phase_pairs(1)).spectra)(3.0)
 
     method = synthesis(near, phase_pairs(1))
-    for shape in ((2, 85, 96), (3, 96, 85)):
-        with pytest.raises(ValueError, match=r"captures have shape .*give \(2, …, 96, 85\)"):
-            method(jnp.ones(shape), 1e-6)
-    captures = jnp.ones((2, 96, 85))
-    for variance in (0.0, -1.0, np.array([1e-6, 0.0])):
-        with pytest.raises(ValueError, match="noise_variance .* must be positive"):
-            method(captures, variance)
-    with pytest.raises(ValueError, match=r"noise_variance has shape \(3,\)"):
-        method(captures, np.full(3, 1e-6))
+    with pytest.raises(ValueError, match=r"captures have shape .*give \(2, …, 96, 85\)"):
+        method(jnp.ones((2, 85, 96)), 1e-6)
+    with pytest.raises(ValueError, match="noise_variance .* must be positive"):
+        method(jnp.ones((2, 96, 85)), np.array([1e-6, 0.0]))
 
 
 SHAPE, PITCH = (54, 60), 0.025

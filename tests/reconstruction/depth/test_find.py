@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.ndimage as ndimage
 from reconstruction.depth import blurred, rig
-from reconstruction.rig import unchecked
 
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick
@@ -93,15 +92,6 @@ def test_objects_before_a_camera_are_found():
     found = find_distances(sweep, regions=regions)
     assert found.distance_of(1).distance == pytest.approx(20, rel=0.05)
     assert found.distance_of(2).distance == pytest.approx(45, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("regions", "part"),
-    [(np.zeros(blurred.SHAPE, int), "no label above 0"), (np.ones((4, 5), int), "of \\(48, 90\\)")],
-)
-def test_bad_regions_are_refused(regions, part):
-    with unchecked(), pytest.raises(ValueError, match=part):
-        find_distances(blurred.sweep(), regions=regions)
 
 
 @pytest.mark.parametrize("measure", MEASURES[:2])
@@ -218,21 +208,6 @@ def test_slope_jit_and_batch(measure):
     gradient = jax.jit(jax.grad(lambda i: focus_measure(i, measure)))
     found = np.sum(gradient(images[0]) * direction)
     assert float(found) == pytest.approx(float(slope), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("settings", "part"),
-    [
-        ({"smoothing": -1.0}, "smoothing = -1.0 pixels"),
-        ({"window": 0}, "window = 0 holds no pixels"),
-        ({"region": np.zeros((31, 44), bool)}, "region holds no pixel"),
-        ({"region": np.ones((44, 31), bool)}, "region has shape"),
-        ({"region": np.ones((31, 44), bool), "window": 3.0}, "not both"),
-    ],
-)
-def test_faults_are_refused(settings, part):
-    with unchecked(), pytest.raises(ValueError, match=part):
-        focus_measure(picture(), **settings)
 
 
 def test_colours_share_one_depth_map():

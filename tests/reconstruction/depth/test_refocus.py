@@ -73,14 +73,6 @@ def test_the_noise_of_all_images_is_that_of_the_captures(recording):
     np.testing.assert_allclose(estimated.images, known.images, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "distances", [(20.0, 30.0), (30.0, 20.0, 10.0), (0.0, 1.0, 2.0), (1.0, 2.0, np.inf), 20.0]
-)
-def test_bad_distances_are_refused(recording, distances):
-    with pytest.raises(ValueError, match="distances"):
-        refocus_sweep(recording, distances, tc.FringeScanning())
-
-
 def test_what_has_no_distance_and_what_does_not_compare_is_refused(recording):
     psfs = tc.Recording(jnp.ones((1, 20, 21)), tc.Psfs(jnp.ones((1, 5, 6))))
     message = r"the PSFs have 1 planes, .* for 4 distances; give one for each"
