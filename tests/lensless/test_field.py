@@ -1,13 +1,11 @@
 """The operator over the field against the PSF of each point."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators.base import adjoint_error
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.lensless.psf import psf_about_ray
@@ -82,10 +80,6 @@ def test_a_small_field_is_a_convolution():
         )
         < 1e-2
     )
-
-
-def test_adjoint(fit):
-    assert adjoint_error(fit.operator, jax.random.key(0)) < 1e-12
 
 
 @pytest.mark.thorough

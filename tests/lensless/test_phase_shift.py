@@ -148,10 +148,6 @@ class TestHarmonics:
         # One row of a sensor: along u alone the chirp has √(π/mβ) in place of π/mβ.
         assert level[1] / level[3] == pytest.approx(3**1.5, rel=0.03)
 
-    def test_bad_harmonics_are_refused(self):
-        with pytest.raises(ValueError, match="harmonic = -1; give a whole number"):
-            harmonic_otf(camera(), -1, wavelength=WAVELENGTH, pixel_integration=False)
-
 
 def test_other_masks_are_refused():
     other = tc.LenslessCamera(tc.SampledMask(jnp.ones((3, 4)), 0.1), tc.Sensor((4, 5), 0.1), 5.0)

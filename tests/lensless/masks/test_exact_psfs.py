@@ -86,19 +86,6 @@ def eqx_set(mask, **numbers):
     return copy
 
 
-@every_family("mura")
-def test_light_that_passes_arrives(name):
-    """Σ h pitch²/M² is the light that passes, but for what is diffracted beyond the sensor."""
-    mask, half = families.masks()[name], 9.0
-    height, width = (float(side) for side in mask.extent)
-    pitch = 0.9 * WAVELENGTH * DISTANCE * 4 / width  # below 1/band
-    count = int(2 * half / pitch)
-    h = psf_of(mask, 60.0, sensor=tc.Sensor((count, count + 1), pitch), distance=4 * DISTANCE)
-    arrived = h.sum() * pitch**2 / (1 + 4 * DISTANCE / 60.0) ** 2
-    passed = np.mean(np.abs(families.cells(name, mask)) ** 2) * height * width
-    assert 0 < 1 - arrived / passed < 0.03
-
-
 @pytest.mark.parametrize("name", quick(SHADOWED, 0, 3))
 def test_shadow(name):
     """`geometric` is |t|² of the cell, its pixel averages are exact, and it is the limit λ → 0."""
@@ -119,20 +106,6 @@ def test_shadow(name):
     # Short waves: within the waves of the nearest edges.
     waves = psf_of(mask, 40.0, wavelength=1e-12)
     assert relative_l2(waves, psf_of(mask, 40.0, model="geometric")) < 5e-3
-
-
-@every_family("ura")
-def test_near_and_far(name):
-    """The shadow at a nanometre; at a metre against quadrature, to 1e-9 of a PSF of 1e-6."""
-    mask = families.masks()[name]
-    found = psf_of(mask, 40.0, distance=1e3)
-    assert relative_l2(found, families.psf(name, mask, 40.0, distance=1e3)) < 1e-9
-    if name == "lenslets":  # they bend, and block nothing
-        mask = tc.Pinhole(15 * families.CELL, 10 * families.CELL, centre=families.CENTRE)
-    sensor = tc.Sensor(SHAPE, 0.0313)  # no pixel's centre lies on an edge
-    shadow = psf_of(mask, 40.0, model="geometric", distance=1e-6, sensor=sensor)
-    found = psf_of(families.masks()[name], 40.0, distance=1e-6, sensor=sensor)
-    assert relative_l2(found, shadow) < 0.02
 
 
 @every_family("xor")

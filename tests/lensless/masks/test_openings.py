@@ -122,19 +122,3 @@ def test_every_site_of_a_voronoi_fresnel_mask_is_a_focus(key):
     near = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
     even = np.sqrt(0.4 * 0.52 / 12)
     assert near.min() > 0.7 * even
-
-
-def test_refuses(key):
-    with pytest.raises(ValueError, match="correlation_length = 0.003 mm is 1.5 cells of the blank"):
-        diffuser(key, BLANK, correlation_length=3 * um, rms_slope=0.1)
-    lenses = {"focal_length": 2.0, "wavelength": WAVELENGTH}
-    with pytest.raises(ValueError, match="sites = 0; give 1 to the number of cells"):
-        voronoi_fresnel(key, BLANK, sites=0, **lenses)
-    with pytest.raises(ValueError, match=r"a lens reaches .* give more sites, a longer focal_len"):
-        voronoi_fresnel(key, BLANK, sites=1, **lenses)
-    with pytest.raises(ValueError, match=r"height reaches from 0 to .*; give 0 to 0.1 mm"):
-        diffuser(key, BLANK, correlation_length=16 * um, rms_slope=10.0)
-    with pytest.raises(
-        ValueError, match=r"height has shape \(3, 4\) and the blank \(.*give as many"
-    ):
-        BLANK.mask(np.zeros((3, 4)))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import os
 import subprocess
 import sys
@@ -30,22 +29,6 @@ SENSOR, FIELD = (24, 30), (10, 14)
 EXACT = tc.PsfMethod("separable", pixel_integration=True, nodes=89)
 
 
-def random_case(random: np.random.Generator):
-    """A camera, a scene up to 45° wide, and a tolerance."""
-    distance, pitch = random.uniform(1.0, 8), random.uniform(15, 90) * um
-    width = random.uniform(0.6, 1.3) * SENSOR[1] * pitch
-    finest = random.uniform(0.2, 0.9) / (2 * pitch)  # cycles/mm at the mask's edge
-    beta = 2 * math.pi * finest / width
-    mask = tc.FresnelZoneAperture(beta, random.uniform(0, 6), width=width)
-    camera = tc.LenslessCamera(mask, tc.Sensor(SENSOR, pitch), distance)
-    t = math.exp(random.uniform(math.log(50), math.log(2000)))
-    picture = resize(sample_image("astronaut", linear=True).mean(axis=-1), FIELD)
-    image = np.clip(picture + random.uniform(0, 0.6) * random.normal(size=FIELD), 0, None)
-    plane = tc.ImagePlane(image, t, FIELD[1] * pitch / distance * t)
-    scene = tc.Scene(plane, random.uniform(400, 700) * nm)
-    return camera, scene, math.exp(random.uniform(math.log(2e-3), math.log(0.3)))
-
-
 def captured(camera, scene, exact=EXACT):
     """The sum over the points, each with its PSF and light: those of a quarter, mirrored."""
     (plane,), (wavelength,) = scene.planes, scene.spectrum.wavelengths
@@ -66,34 +49,9 @@ def captured(camera, scene, exact=EXACT):
     return total
 
 
-def errors(count: int, seed: int) -> np.ndarray:
-    """(tolerance, predicted, true, choice, met) of so many cameras; choices: 0 axis, 1 its PSF."""
-    random, found = np.random.default_rng(seed), []
-    for _ in range(count):
-        camera, scene, tolerance = random_case(random)
-        plan = tc.plan_capture(camera, scene, tolerance=tolerance)
-        own = plan.method.field_tolerance
-        choice = 0 if own is None else 1 if own >= 1 else 2
-        true = relative_l2(
-            np.asarray(tc.capture(camera, scene, model=plan)), captured(camera, scene)
-        )
-        found.append((tolerance, plan.predicted_error, true, choice, plan.meets_tolerance))
-    return np.array(found, float)
-
-
 @pytest.mark.thorough
-def test_predictions_hold_over_random_cameras():
-    """None of these 24 needs its own PSFs; 13 of 40 in `benchmarks/test_field_plans.py` do."""
-    found = errors(24, seed=1)
-    _, predicted, true, choice, met = found.T
-    assert np.mean(true <= predicted) > 0.95
-    assert np.mean(predicted <= 10 * true) > 0.7
-    assert met.all() and set(choice) == {0, 1}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("kind", ["mura", "random"])
-def test_predictions_hold_for_other_masks(kind):
+@pytest.mark.parametrize("kind", ["plate", "mura", "random"])
+def test_predictions_hold_over_random_cameras(kind):
     """Many more, phase masks among them, are in `benchmarks/test_field_plans.py`."""
     _, predicted, true, choice, _ = spots.errors(4, seed=20261126, kind=kind).T
     assert np.all(true <= predicted) and np.all(predicted <= 10 * true)

@@ -120,20 +120,3 @@ def test_transform(shape):
     expected *= np.exp(-2j * np.pi * (v[:, None] * CENTRE[0] + u * CENTRE[1]))
     expected[shape[0] // 2, shape[1] // 2] += WEIGHTS[0].real * shape[0] * shape[1] * 0.05**2
     np.testing.assert_allclose(transform(SUM, grid), expected, rtol=0, atol=1e-12)
-
-
-def test_transform_by_summation():
-    """A direct sum over the plane, faded out by e^{−αr²}; what the fading costs falls with α."""
-    chirp = ChirpSum(jnp.asarray([0.3 - 0.2j]), jnp.asarray([30.0]), jnp.asarray(CENTRE))
-    grid = tc.Grid((5, 8), 0.1)
-    value = np.asarray(transform(chirp, grid))
-    v, u = (np.fft.fftshift(np.fft.fftfreq(n, 0.1)) for n in grid.shape)
-    x = reference.centred(1200, 0.01)
-    r2 = (x[:, None] - CENTRE[0]) ** 2 + (x - CENTRE[1]) ** 2
-    errors = []
-    for alpha in (0.6, 0.3):
-        faded = ((0.3 - 0.2j) * np.exp((30j - alpha) * r2)).real
-        kernels = [np.exp(-2j * np.pi * np.outer(f, x)) for f in (v, u)]
-        expected = kernels[0] @ faded @ kernels[1].T * 0.01**2
-        errors.append(np.abs(value - expected).max() / np.abs(value).max())
-    assert errors[1] < 0.3 and 1.6 < errors[0] / errors[1] < 2.4

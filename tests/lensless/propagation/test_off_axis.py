@@ -229,47 +229,6 @@ def test_averages_are_means_over_points_of_a_pixel(pitch, most):
     assert relative(np.asarray(found), exact) < most
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(("pitch", "shape"), [(25, (18, 22)), (40.5, (11, 13)), (102.8, (6, 8))])
-def test_averages_follow_the_fringes_of_a_pixel(pitch, shape):
-    """10.9, 17.6 and 44.7 fringes: 12 nodes left 0.8 to 3 %. One point has one PSF."""
-    mask = tc.FresnelZoneAperture(160.0, 0.4, width=0.5)
-    light = {"wavelength": 500 * nm, "object_distance": 40.0}
-    camera = tc.LenslessCamera(mask, tc.Sensor(shape, pitch * um), 2.3)
-    points = round(9 * pitch * 0.5 / 1.15) // 2 * 2 + 1
-    rows, columns = shape
-    fine = camera.on_grid(tc.Grid((rows * points, columns * points), pitch * um / points))
-    exact = np.asarray(point_psf(fine, at=(1.5, 2.0), **light))
-    exact = exact.reshape(rows, points, columns, points).mean((1, 3))
-    averaged = light | {"pixel_integration": True}
-    found = np.asarray(tc.psf(camera, at=(1.5, 2.0), **averaged))
-    assert relative(found, exact) < 2e-4
-    plain = tc.psf(camera, **averaged)
-    traced = jax.jit(lambda at: tc.psf(camera, at=at, **averaged))(jnp.zeros(2))
-    assert relative(tc.psf(camera, at=(1e-9, 1e-9), **averaged), plain) < 1e-6
-    assert relative(traced, plain) < 1e-6
-
-
-@pytest.mark.thorough
-def test_averages_have_slopes_and_one_program():
-    """The slope against a difference, of the angle and of β."""
-    weights = np.random.default_rng(0).normal(size=SENSOR.shape)
-
-    def value(at, beta):
-        camera, model = camera_of(beta), tc.PsfMethod(pixel_integration=True, nodes=4)
-        return jnp.sum(weights * tc.psf(camera, wavelength=500 * nm, at=at, model=model))
-
-    counted = count_traces(value)
-    compiled = jax.jit(counted)
-    slopes = jax.jit(jax.grad(value, argnums=(0, 1)))(jnp.array([0.2, 0.3]), 25.0)
-    for k, step in enumerate(((1e-6, 0.0), (0.0, 1e-6))):
-        low, high = (compiled(jnp.array([0.2, 0.3]) + s * jnp.array(step), 25.0) for s in (-1, 1))
-        assert float(slopes[0][k]) == pytest.approx(float(high - low) / 2e-6, rel=1e-4)
-    low, high = (compiled(jnp.array([0.2, 0.3]), 25.0 + s * 1e-5) for s in (-1, 1))
-    assert float(slopes[1]) == pytest.approx(float(high - low) / 2e-5, rel=1e-4)
-    assert counted.traces == 1
-
-
 # --- limits, slopes, precision --------------------------------------------------------------------
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import count_traces, quick, relative_l2, value_and_slope
+from helpers import quick, relative_l2
 from thincam_jax.lensless.method import LATTICE_POINTS, AccuracyWarning
 from thincam_jax.lensless.propagation.separable import (
     SeparableSum,
@@ -58,37 +58,6 @@ def test_lattice(count):
     for axis in (0, 1):
         np.testing.assert_allclose(np.sort(points[:, axis]), midpoints, atol=1e-12)
     np.testing.assert_allclose(points[::-1], -points, atol=1e-12)
-
-
-@pytest.mark.thorough
-def test_slopes_and_batches():
-    """In distance, light and cells, against finite differences; no new program for new values."""
-    mask, grid, path = parts_of(MASKS["wide"])
-
-    def brightness(amplitude, distance, wavelength):
-        changed = tc.SampledMask(amplitude, mask.pitch, centre=mask.centre)
-        moved = type(path)(wavelength, distance, path.object_distance)
-        image = separable_image(changed, grid, moved, nodes=3)
-        return jnp.sum(image * jnp.cos(jnp.arange(grid.shape[1])))
-
-    at = (mask.amplitude, jnp.asarray(3.0), jnp.asarray(500 * nm))
-    counted = count_traces(brightness)
-    brightness, slope = value_and_slope(counted, (0, 1, 2))
-    slopes = slope(*at)
-    way = (jnp.asarray(RANDOM.normal(size=(5, 8))), jnp.asarray(0.1), jnp.asarray(20 * nm))
-    step = 1e-4
-
-    def moved(sign):
-        return brightness(*(a + sign * step * w for a, w in zip(at, way, strict=True)))
-
-    expected = (moved(1) - moved(-1)) / (2 * step)
-    found = sum(jnp.sum(s * w) for s, w in zip(slopes, way, strict=True))
-    assert float(found) == pytest.approx(float(expected), rel=1e-5)
-    assert counted.traces == 1
-    distances = jnp.asarray([2.9, 3.1])
-    both = jax.jit(jax.vmap(counted, (None, 0, None)))(at[0], distances, at[2])
-    one_by_one = [brightness(at[0], d, at[2]) for d in distances]
-    np.testing.assert_allclose(both, one_by_one, rtol=1e-12)
 
 
 @pytest.mark.thorough
