@@ -51,15 +51,14 @@ def test_psf_has_the_transfer_function_of_overlaps():
     """With finer samples less of the light beyond their band is missed."""
     cells, u = drawn(), np.array([1.3, 5.0, 9.7])
     wanted, errors = np.array([transfer(cells * 1.0, f) for f in u]), []
-    for pitch in (0.02, 0.005, 0.0025):
+    for pitch in (0.02, 0.0025):
         optics = CellOptics(space(), FAR, pitch)
         psf, step = np.asarray(optics(jnp.asarray(cells * 1.0))), float(optics.grid.pitch)
         waves = np.exp(-2j * np.pi * u * np.asarray(optics.grid.x)[:, None])
         found = step**2 * (psf.sum(0) @ waves) / np.sinc(step * u)
         errors.append(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
     assert errors[0] < 0.1
-    assert errors[1] < 0.02
-    assert errors[2] < 0.005
+    assert errors[1] < 0.005
 
 
 @pytest.mark.parametrize("levels", LEVELS)

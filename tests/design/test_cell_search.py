@@ -63,7 +63,7 @@ def test_tolerances_are_kept():
     """The error that is found is the mean over them, of images made for the exact masks; a mask
     found for them is better over them than one that is not."""
     tolerances = Tolerances(distance=0.15, wavelength=1e-5)
-    settings = CellSettings(8, 1, 4, flips=30)
+    settings = CellSettings(8, 1, 4, flips=12)
     robust, exact = (find_cells(SETUP, space(), settings, tolerances=t) for t in (tolerances, None))
 
     def mean(design):

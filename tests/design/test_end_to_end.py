@@ -226,8 +226,7 @@ def test_errors():
             TrainedSensor(SENSOR, (4.0, 7.0)),
             key=jax.random.key(0),
         )
-    with pytest.raises(ValueError, match="adds 2 captures and the design takes 4"):
-        end_to_end_error(design(), training(synthesis=phase_pairs(1)))
+
     with pytest.raises(ValueError, match="rows of zeros"):
         training(synthesis=np.zeros((1, 4)))
 

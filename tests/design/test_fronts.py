@@ -52,14 +52,6 @@ def test_directions_ties_and_what_is_no_number():
     assert non_dominated(infinite, larger=(False, True)).tolist() == [True, False]
 
 
-@pytest.mark.parametrize("points", [np.zeros((3, 3)), np.zeros(3)])
-def test_an_objective_without_a_direction_is_refused(points):
-    with pytest.raises((ValueError, TypeError)):
-        non_dominated(points, larger=(True, False))
-    with pytest.raises(ValueError, match="larger has 1 entries; give"):
-        non_dominated(np.zeros((3, 2)), larger=(True,))
-
-
 SETTINGS = SearchSettings(starts=2, samples=8, steps=4)
 DISTANCE = small.shared("distance", 2.0, 3.0)
 

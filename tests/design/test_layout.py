@@ -93,11 +93,6 @@ def test_what_is_too_fine_is_refused_and_the_advice_holds(tmp_path):
     [
         (tc.SampledMask([[0.5, 1.0]], pitch=0.1), ValueError, "grey or complex parts"),
         (
-            tc.FresnelZoneAperture(25.0, width=1.6),
-            ValueError,
-            "'cosine' is grey; give 'binary', or ",
-        ),
-        (
             tc.FresnelZoneAperture(25.0, width=1.6, profile="binary", pixel_pitch=0.1),
             TypeError,
             "leave out pixel_pitch",
@@ -108,7 +103,7 @@ def test_what_is_too_fine_is_refused_and_the_advice_holds(tmp_path):
             "no layout of polygons; give a binary mask",
         ),
     ],
-    ids=["grey", "cosine", "display", "relief"],
+    ids=["grey", "display", "relief"],
 )
 def test_other_masks_are_refused(mask, error, message, tmp_path):
     with pytest.raises(error, match=message):

@@ -66,17 +66,6 @@ def test_slopes(model):
     assert np.all(np.isfinite(slope(point, model.levels(point))))
 
 
-def test_errors():
-    with pytest.raises(ValueError, match="rings = 0; give at least 1"):
-        ResponseModel(two_betas(), *DATA, 0)
-    with pytest.raises(ValueError, match="rings = 200, and the frequencies lie in 128 of them"):
-        ResponseModel(two_betas(), *DATA, 200)
-    with pytest.raises(ValueError, match=r"shape \(3,\); give \(16,\), a level in dB"):
-        checked_levels([1.0, 2.0, 3.0], 16, jnp.float64)
-    with pytest.raises(ValueError, match="ring 2 is inf, no finite number"):
-        checked_levels([1.0, np.inf], 2, jnp.float64)
-
-
 def test_traced_levels_pass():
     levels = jax.jit(lambda w: checked_levels(w, 2, jnp.float64))(jnp.array([1.0, -1.0]))
     np.testing.assert_array_equal(levels, [1.0, -1.0])

@@ -281,8 +281,3 @@ def test_objectives_are_minimised_and_reported_in_their_sense():
     assert hash(ratio) == hash(WorstRatio(band))  # compiled once
     assert WorstRatio(band) == ratio != WorstRatio()
     assert edge.label == "limit of resolution (cycles/rad)"
-
-
-def test_synthesis_must_fit():
-    with pytest.raises(ValueError, match=r"give \(channel, 4\), one column for each"):
-        channels(TESTED, setup(), jnp.ones((2, 3)), FREQUENCIES)

@@ -132,8 +132,3 @@ def test_gradient_by_differences(how):
         step = jnp.zeros(6).at[index].set(1e-6 * value)
         difference = (error(place + step) - error(place - step)) / (2e-6 * value)
         assert float(slope[index] / difference) == pytest.approx(1, abs=1e-4)
-
-
-def test_other_ways_are_refused():
-    with pytest.raises(Exception, match="median"):
-        robust(Tolerances(), how="median")
