@@ -85,13 +85,6 @@ def test_unknown_samples_are_left_out():
     assert np.argwhere(~has).tolist() == [[1, 2, 0]]
 
 
-def test_what_is_refused():
-    with pytest.raises(ValueError, match=r"joins 2×2 pixels and the mosaic has 5×6.*'bilinear'"):
-        demosaic(np.zeros((5, 6)), "RGGB", "superpixel")
-    with pytest.raises(ValueError, match=r"has 1×6 pixels; give at least 2×2"):
-        demosaic(np.zeros((1, 6)), "RGGB")
-
-
 def test_noise_level_counts_where_it_is_the_larger():
     psf = np.array([[[8.0, 1.0, 0.5, 0.2]]])
     for noise, kept in ((0.3, 2), (0.1, 3), (0.01, 4)):

@@ -99,17 +99,3 @@ def test_one_exposure_is_the_mean_of_its_frames():
     merged = merge_exposures([one], FULL)
     expected = (one.frames.mean(axis=0) - one.dark.mean(axis=0)) / 0.002
     np.testing.assert_allclose(merged.rate, expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: merge_exposures([]), "no exposures; give one"),
-        (lambda: ExposedFrames(0.1, np.ones((1, 3, 4)), np.ones((2, 3, 4))), "frames: 1 at 0.1 s"),
-        (lambda: ExposedFrames(0.0, np.ones((2, 3, 4)), np.ones((2, 3, 4))), "more than 0"),
-        (lambda: ExposedFrames(0.1, np.ones((2, 3, 4)), np.ones((2, 4, 3))), "equal shapes"),
-    ],
-)
-def test_what_cannot_be_merged(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()

@@ -180,13 +180,9 @@ WRONG_VALUES = [
     (np.zeros(SHAPE, bool), "holds bool values.*mask"),
     (np.zeros(SHAPE, np.complex64), "holds complex64 values.*magnitude"),
     (np.zeros(SHAPE, np.int16), "holds int16 values.*no sign"),
-    (np.zeros(SHAPE, np.uint32), "holds uint32 values.*8 to 16 bit"),
-    (np.full(SHAPE, "a"), "holds <U1 values; give uint8, uint16 or float$"),
     (np.zeros((0, 5), np.uint8), r"is empty \(shape \(0, 5\)\)"),
-    (np.zeros(5, np.uint8), r"has shape \(5,\)"),
     (np.zeros((2, 3, 4, 1), np.uint8), r"has shape \(2, 3, 4, 1\)"),
     (np.zeros((4, 6, 5), np.uint8), "5 channels, where 1 to 4"),
-    (np.full(SHAPE, np.nan, np.float32), "70 of 70 values are NaN or infinite"),
     (np.array([[1.0, -np.inf]]), "1 of 2 values are NaN or infinite"),
 ]
 

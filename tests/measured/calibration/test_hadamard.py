@@ -54,12 +54,6 @@ def test_what_is_no_power_of_two_is_refused():
         HadamardSeries((60, 64))
     with pytest.raises(ValueError, match="no power of two"):
         walsh_hadamard(np.ones((12, 2)))
-    with pytest.raises(ValueError, match="there are 8 patterns; give 0 … 7"):
-        hadamard_pattern(8, (2, 4))
-    with pytest.raises(ValueError, match="frame 16 of 16: give 0 … 15"):
-        HadamardSeries((2, 4)).frame(16)
-    with pytest.raises(ValueError, match="dark_frames = -1"):
-        HadamardSeries((2, 4), dark_frames=-1)
 
 
 SERIES = HadamardSeries((4, 8), "natural", "binary", dark_frames=3)

@@ -127,18 +127,10 @@ def test_known_images_give_all_terms():
 
 
 def test_bad_input():
-    rows, columns = stripes(camera())
-    with pytest.raises(ValueError, match=r"shapes \(8, 22, 27\) and \(0, 22, 27\); give"):
-        calibrate_separable(rows, columns[:0])
-    with pytest.raises(ValueError, match="the captures are dark"):
-        calibrate_separable(0 * rows, 0 * columns)
-    with pytest.raises(ValueError, match="no power of two"):
-        calibrate_separable(rows[1:], columns, shown="hadamard")
+
     images = jnp.ones((2, *FIELD))
     with pytest.raises(ValueError, match="2 images do not tell one camera"):
         fit_separable(images, camera()(images), camera())
-    with pytest.raises(ValueError, match=r"the camera takes \(j, 8, 16\)"):
-        fit_separable(images, images, camera())
 
 
 def blind(scale, offset, blur, shading):
