@@ -111,9 +111,9 @@ def test_exposures_of_the_display_have_its_shot_noise():
 
 def test_a_plan_leaves_it_out_below_the_tolerance():
     """And says how much it is of the image otherwise; the level is that of the image."""
-    plane = wg.ObjectPlane((12, 15), 550.0, 150.0, (27.0, 0.0))
-    scene = wg.LitPlane(plane, resize(sample_image("camera"), (12, 15)))
-    sts = dataclasses.replace(camera(), sensor=tc.Sensor((14, 18), 120e-3))
+    plane = wg.ObjectPlane((24, 28), 550.0, 150.0, (27.0, 0.0))
+    scene = wg.LitPlane(plane, resize(sample_image("camera"), (24, 28)))
+    sts = dataclasses.replace(camera(), sensor=tc.Sensor((6, 5), 280e-3))
     bare = wg.plan_screen(sts, scene, tolerance=0.03)
     bright, faint = (
         wg.plan_screen(sts, scene, tolerance=0.03, display=DisplayLight(leak, LCD))

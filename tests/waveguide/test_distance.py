@@ -110,9 +110,6 @@ class TestDistance:
             ({"nearest": 900.0, "farthest": 300.0}, "give nearest below it"),
             ({"nearest": 500.0, "farthest": 510.0}, "moves by more than 2"),
             ({"nearest": 20.0}, "give a larger nearest distance"),
-            ({"orders": 1}, "give at least 2"),
-            ({"capture": np.zeros(SHAPE)}, "is dark"),
-            ({"capture": np.ones(SHAPE[::-1])}, "capture has shape"),
         ],
     )
     def test_a_misuse_is_named_with_what_to_do(self, changes, advice):

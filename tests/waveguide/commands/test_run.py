@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import asdict
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,6 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.waveguide.commands.run import build_cameras, build_screen, run_screen
-from thincam_jax.waveguide.field_of_view import field_of_view
 from thincam_jax.waveguide.rays import RayStatus
 
 
@@ -36,19 +34,6 @@ def run(tmp_path_factory):
 
 
 PICTURES = ("rays", "field", "images", "models", "errors", "columns", "distances")
-
-
-@pytest.mark.thorough
-def test_without_a_calibration_there_is_a_report(tmp_path):
-    """Its page does not speak of one, and neither do the tables."""
-    config = tiny.experiment(tmp_path, "calibration=null", "models=[{name: right}]")
-    result = run_screen(build_screen(config), RunFolder(tmp_path / "out"), Told())
-    metrics = stored(tmp_path / "out")
-    ((name, mean, _),) = result.table().rows
-    assert name == "right" and mean == metrics["models"]["right"]["methods"]["CGM"]["mean_psnr_db"]
-    assert metrics["models"]["right"]["methods"]["CGM"]["mean_psnr_db"] > 25
-    page = (tmp_path / "out" / "report.html").read_text("utf-8")
-    assert "calibration" not in metrics and "Hadamard" not in page
 
 
 LIT = (
@@ -135,18 +120,6 @@ def test_a_file_of_a_colour_sensor(tmp_path):
 
 
 @pytest.mark.thorough
-def test_field_of_view_is_in_the_metrics_and_on_the_page(run):
-    study, path, metrics, _ = run
-    told = metrics["rays"]
-    for name, orders in (("field_of_view", 1), ("field_with_ghosts", study.orders)):
-        assert told[name] == asdict(field_of_view(study.camera, orders=orders))
-    page = (path / "report.html").read_text("utf-8")
-    # 22 × 30 pixels of 70.4 µm, 6 mm before the lens.
-    expected = "Field of view, vertical × horizontal: 14.7° × 20.0°, with ghosts 14.7° × 20.0°."
-    assert expected in page
-
-
-@pytest.mark.thorough
 def test_progress_and_files(run):
     study, path, _, texts = run
     assert len(texts) == texts.total == 1 + 3 * 2 + (1 + 2 + 1 + 1) + 1
@@ -213,9 +186,7 @@ for _lens, _mask in (
         ("calibration={bits: 10}", "calibration: measures a camera with a lens; drop it"),
         ("screen.tilt=[1 deg, 0 deg]", "screen.tilt: a mask is parallel to the plate; drop"),
         ("models.1.mistake=grating", "models[1].mistake: 'grating' is of a camera with a lens; ch"),
-        ("mask.focal_distance=6 mm", "mask.focal_distance: unknown key; allowed here: width"),
         ("mask.points=4", "mask.points: points = 4 is even; give 5"),
-        ("mask={width: 1.4 mm, distance: 6 mm, gap: 1 mm}", "mask.beta: missing; this key is"),
     ],
 )
 def test_what_does_not_hold_behind_a_mask_is_refused_in_one_line(override, part, tmp_path):
