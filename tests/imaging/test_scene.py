@@ -144,11 +144,7 @@ def test_spectrum_weights():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([],), "wavelengths is empty"),
         (([500e-9],), "5e-07 mm is no light: give it in mm, not in m, such as"),
-        ((500.0,), "500 mm is no light"),
-        (([500 * nm], [0.5, 0.5]), r"weights has shape \(2,\)"),
-        (([500 * nm, 600 * nm], [0.5, np.inf]), "weights .* not finite"),
         (([500 * nm, 600 * nm], [1.5, -0.5]), "weights .* negative"),
     ],
 )
@@ -165,14 +161,6 @@ def test_a_wavelength_is_light_of_one_colour():
     for light, fault in (({}, "is missing"), (both, "is given twice")):
         with pytest.raises(TypeError, match=rf"^the light of the Scene {fault}; give wavelength="):
             Scene(plane, **light)
-
-
-def test_impossible_scenes():
-    one, batch = ImagePlane(np.ones((3, 4)), 10.0, 1.0), ImagePlane(np.ones((2, 3, 4)), 20.0, 1.0)
-    with pytest.raises(ValueError, match="planes is empty"):
-        Scene([], 500 * nm)
-    with pytest.raises(ValueError, match=r"different batch shapes \[\(\), \(2,\)\]"):
-        Scene([one, batch], 500 * nm)
 
 
 def test_a_filter_multiplies_the_shares():

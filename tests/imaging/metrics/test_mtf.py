@@ -133,32 +133,6 @@ def test_low_frequency_value_is_the_root_mean_square_of_the_lowest_twentieth():
 LINE = np.interp(U, [20, 30], [1.0, 0.0])
 
 
-@pytest.mark.parametrize("limit", [cut_off, lambda u, h: first_common_zero(u, [h])])
-@pytest.mark.parametrize(
-    ("frequency", "response", "message"),
-    [
-        (U, LINE[:-1], r"shapes \(800,\), \(799,\); give equal lengths"),
-        (U[:, None], LINE[:, None], "equal lengths"),
-        (U[::-1], LINE, "must ascend"),
-        (U - 1.0, LINE, "from zero or above"),
-        (np.repeat(U[::2], 2), LINE, "drop repeats"),
-        (U, np.where(U == U[7], np.nan, LINE), "of finite numbers"),
-        (U[:10], LINE[:10], "sample the response more finely"),
-        (U[:0], LINE[:0], "equal lengths"),
-    ],
-)
-def test_refuses_what_is_no_response(limit, frequency, response, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        limit(frequency, response)
-
-
-def test_refuses_nothing_to_measure():
-    with pytest.raises(ValueError, match="no cut-off"):
-        cut_off(U, np.zeros_like(U))
-    with pytest.raises(ValueError, match="at least one"):
-        first_common_zero(U, [])
-
-
 # The thesis' set-up (section 3.5.1): 1024² pixels of 5.5 µm, a mask of 5.632 mm, λ = 500 nm.
 CONVENTIONAL_5, CONVENTIONAL_6, METHOD_A, METHOD_B = range(4)
 

@@ -173,21 +173,3 @@ def test_a_wrong_size_of_the_chart_is_noticed():
     wrong = resolved_element(usaf_contrast(chart, ONE_LAYER, 128.0))
     assert right.group == -1
     assert wrong is None
-
-
-def test_errors():
-    chart = usaf1951((64, 80), layers=1)
-    with pytest.raises(ValueError, match=r"\(64, 80, 3\)"):
-        usaf_contrast(np.zeros((64, 80, 3)), ONE_LAYER, 64)
-    with pytest.raises(ValueError, match="outside the image"):
-        usaf_contrast(chart, ONE_LAYER, 100)
-    with pytest.raises(ValueError, match="pixels_per_chart"):
-        usaf_contrast(chart, ONE_LAYER, 0)
-    with pytest.raises(ValueError, match="NaN"):
-        usaf_contrast(np.where(chart > 2, 0, np.nan), ONE_LAYER, 64)
-    with pytest.raises(ValueError, match="records is empty"):
-        resolved_element([])
-    with pytest.raises(ValueError, match="threshold = 0"):
-        resolved_element(usaf_contrast(chart, ONE_LAYER, 64), threshold=0)
-    with pytest.raises(ValueError, match="has only vertical bars"):
-        resolved_element(usaf_contrast(chart, ONE_LAYER[:1], 64))

@@ -173,14 +173,3 @@ def test_planes_or_channels_that_are_missing():
     for wrong in ((5, 8), (1, 5, 8), (3, 5, 8)):
         with pytest.raises(ValueError, match=r"\(…, plane, y, x\) = \(2, 5, 8\)"):
             convolution.adjoint(jnp.ones(wrong))
-
-
-def test_bad_sizes():
-    kernel = jnp.ones((3, 4, 6))
-    for summed in (-1, 2):
-        with pytest.raises(ValueError, match=f"summed = {summed}: .* from 0 to 1"):
-            CropConvolution(kernel, PITCH, (5, 8), (6, 11), summed=summed)
-    with pytest.raises(ValueError, match="sensor_shape = .* at least 1"):
-        CropConvolution(kernel, PITCH, (0, 8), (6, 11))
-    with pytest.raises(ValueError, match="field_shape = .* is not a pair"):
-        CropConvolution(kernel, PITCH, (5, 8), (6, 11, 3))

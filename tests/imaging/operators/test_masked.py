@@ -93,20 +93,6 @@ def test_bad_masks():
         Masked(stack(), (VALID,))
 
 
-def test_bad_gains():
-    for wrong in (numbers((2, 5)), numbers((1, 5, 2)), [1, 2, 3]):
-        with pytest.raises(ValueError, match=r"gain has shape .* broadcasts .* \(5, 2\)"):
-            Scaled(matrix(), wrong)
-    with pytest.raises(ValueError, match="gain holds 1 numbers that are not finite"):
-        Scaled(matrix(), np.inf)
-    with pytest.raises(TypeError, match="gain holds complex128; give real"):
-        Scaled(matrix(), 1j)
-    with pytest.raises(ValueError, match="gain has 3 parts; give 2"):
-        Scaled(stack(), (1, 2, 3))
-    with pytest.raises(ValueError, match=r"gain has shape \(5, 1\); .* \(6, 2\)"):
-        Scaled(stack(), numbers((5, 1)))
-
-
 @pytest.mark.parametrize("kind", [lambda o: Masked(o, True), lambda o: Scaled(o, 2.0)])
 def test_captures_of_another_structure(kind):
     one, two = jnp.ones(OUT), (jnp.ones(OUT), jnp.ones((6, 2)))

@@ -156,25 +156,3 @@ def test_it_is_traced_and_differentiated():
     kept = jax.jit(Separable.with_modes)(single)
     assert kept.modes.values.dtype == jnp.float32
     np.testing.assert_allclose(kept.modes.values, operator.with_modes().modes.values, rtol=1e-4)
-
-
-def test_bad_terms():
-    with pytest.raises(ValueError, match="left has 3 terms and right 2; give as many of each"):
-        Separable(numbers((3, 4, 5)), numbers((2, 6, 7)))
-    with pytest.raises(ValueError, match="terms = 0; give a whole number of at least 1"):
-        terms().truncated(terms=0)
-    with pytest.raises(ValueError, match="tolerance = 2; give less than 1"):
-        terms().truncated(2.0)
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match=r"left has shape \(3,\); give rows"):
-        Separable(np.ones(3), np.ones((2, 4)))
-    with pytest.raises(ValueError, match=r"right has shape \(0, 4\); give rows"):
-        Separable(np.ones((6, 3)), np.ones((0, 4)))
-    with pytest.raises(ValueError, match="right holds 1 numbers that are not finite"):
-        Separable(np.ones((6, 3)), np.array([[1, np.nan]]))
-    with pytest.raises(TypeError, match="left holds complex128; give real"):
-        Separable(1j * np.ones((6, 3)), np.ones((2, 4)))
-    with pytest.raises(TypeError, match="left is float32 and right is float64; give both in one"):
-        Separable(np.ones((6, 3), np.float32), np.ones((2, 4)))

@@ -139,14 +139,3 @@ def test_resize_removes_what_the_new_pixels_cannot_hold():
     image = np.tile(stripes, (80, 1))
     small = resize(image, (20, 60))
     assert np.abs(small[2:-2, 2:-2] - 0.5).max() < 0.02
-
-
-@pytest.mark.parametrize("image", [np.zeros(5), np.zeros((0, 3)), np.full((4, 5), np.nan)])
-def test_resize_errors(image):
-    with pytest.raises(ValueError, match="image"):
-        resize(image, (3, 4))
-
-
-def test_an_unknown_sample_lists_the_known():
-    with pytest.raises(ValueError, match=r"'lena' is not a sample image; .*astronaut, .*rocket"):
-        sample_image("lena")

@@ -81,20 +81,6 @@ def test_the_centroid_is_that_of_the_elements():
         assert found_x == pytest.approx(area @ x / area.sum(), abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"shape": (0, 5)}, "shape"),
-        ({"shape": (40, 50), "layers": 0}, "layers = 0"),
-        ({"shape": (40, 50), "polarity": "bright"}, "polarity"),
-        ({"shape": (40, 50), "pixels_per_chart": -1.0}, "pixels_per_chart"),
-    ],
-)
-def test_errors_name_the_argument(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        usaf1951(**arguments)
-
-
 def test_first_group_only_labels():
     standard, other = usaf1951_elements(2), usaf1951_elements(2, first_group=4)
     assert [(e.centre, e.bar) for e in standard] == [(e.centre, e.bar) for e in other]
