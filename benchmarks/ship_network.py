@@ -1,14 +1,12 @@
 """A trained network as it comes with the package: its weights in half precision.
 
-`python ship_network.py NETWORK [PART]`: a denoiser, or a reconstruction for the camera of
-DiffuserCam's tutorial, of which only a part of what the network adds is kept. A network that knows
-its captures too well adds too much: the captures that judge the training tell the part.
+`python ship_network.py NETWORK`: a denoiser, or a reconstruction for the camera of DiffuserCam's
+tutorial.
 """
 
 import sys
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -28,16 +26,13 @@ def halved(weights):
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float16), weights)
 
 
-path, *parts = sys.argv[1:]
+(path,) = sys.argv[1:]
 known = read_description(path)
 if known["kind"] == "denoiser":
     place = ROOM / "denoiser/shipped.thincam"
     half = learn.Denoiser(halved(learn.Denoiser.load(path).network))
     half.save(place, known["training"])
 else:
-    place, part = ROOM / "diffusercam.thincam", float(parts[0]) if parts else 1.0
-    model = TrainedReconstruction.load(path)
-    leave = jax.tree.map(lambda leaf: part * leaf, model.network.leave)
-    model = eqx.tree_at(lambda one: one.network.leave, model, leave)
-    halved(model).save(place, {**known["training"], "psf": PSF, "part": part})
+    place = ROOM / "diffusercam.thincam"
+    halved(TrainedReconstruction.load(path)).save(place, {**known["training"], "psf": PSF})
 print(f"{place}: {place.stat().st_size / 1e6:.1f} MB")

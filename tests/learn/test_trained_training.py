@@ -18,7 +18,13 @@ from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.pictures import Pictures
 from thincam_jax.learn.imperfections import Imperfections
 from thincam_jax.learn.sources import Entry
-from thincam_jax.learn.trained import TrainedOptions, TrainedReconstruction, with_whole_field
+from thincam_jax.learn.trained import (
+    TrainedOptions,
+    TrainedReconstruction,
+    cleaned,
+    training_record,
+    with_whole_field,
+)
 from thincam_jax.learn.trained_lessons import (
     CameraLessons,
     PairLessons,
@@ -30,6 +36,7 @@ from thincam_jax.learn.trained_training import (
     ReconstructionLessons,
     gains,
     loss,
+    tempered,
     train_reconstruction,
 )
 from thincam_jax.learn.training import TrainingOptions
@@ -117,6 +124,18 @@ def test_the_network_that_adds_nothing_has_the_loss_of_its_input():
     assert float(parts["before"]) == pytest.approx(float(value))
 
 
+@pytest.mark.parametrize("part", [0.0, 0.25, 1.0])
+def test_the_part_of_a_network_is_kept_that_judges_want(part):
+    rng, network = np.random.default_rng(0), untrained().network
+    leave = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), network.leave)
+    network = eqx.tree_at(lambda one: one.leave, network, leave)
+    images = jnp.asarray(rng.random((3, 2, 1, 12, 20)))
+    added = cleaned(network, 1, jnp.moveaxis(images, 1, 0)) - images[:, -1]
+    found, kept = tempered(network, [PreparedExamples(images, images[:, -1] + part * added)])
+    assert kept == part
+    np.testing.assert_allclose(found.leave.weight, part * network.leave.weight)
+
+
 @pytest.fixture(scope="module")
 def whole():
     return train_reconstruction(untrained(), LESSONS, OPTIONS)
@@ -136,6 +155,7 @@ def test_an_interrupted_training_ends_with_the_same_numbers(whole, tmp_path):
     kept = TrainedReconstruction.load(tmp_path / NETWORK)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), whole.model)
     assert eqx.tree_equal(kept, single)
+    assert training_record(tmp_path / NETWORK)["part"] in (0.0, 0.25, 0.5, 0.75, 1.0)
     other = dataclasses.replace(OPTIONS, rate=1e-3)
     with pytest.raises(CheckpointError, match=r"training\.rate was 0\.003 and is 0\.001 here"):
         train_reconstruction(untrained(), LESSONS, other, folder=tmp_path)

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -44,6 +44,7 @@ STATE = "training.state"
 _FITTING, _TRAINING, _JUDGING = 0, 1, 2
 _LEAST = 1e-5  # of the squared error: 50 dB
 _SCORED = 8  # captures whose whole images are scored at the end
+_PARTS = 0.0, 0.25, 0.5, 0.75, 1.0  # of what the network adds, from which judges choose
 _NOISES = np.log(10.0) * np.arange(-3.0, 3.1, 0.5)  # ln λ that are tried
 
 
@@ -178,6 +179,9 @@ def train_reconstruction(
 ) -> Trained:
     """Fit the physics step, then train the network; the result's `model` is the whole.
 
+    A network that learned its captures by heart adds too much: the part of it that is kept is the
+    best of five for the captures that judge, see `tempered`.
+
     **Arguments**
 
     - `untrained`: new, or trained before, for other captures of the camera.
@@ -191,8 +195,8 @@ def train_reconstruction(
     else:
         physics = lessons.fit(untrained.physics, options.seed)
     made, train = dataclasses.replace(untrained, physics=physics), train_model
+    record = described(lessons, options)
     if path is not None:
-        record = described(lessons, options)
         camera = "" if made.camera is None else made.camera.digest
         settings = {"sizes": dataclasses.asdict(made.options), "camera": camera, **record}
         save = functools.partial(_save, path.with_name(NETWORK), made, record)
@@ -200,8 +204,24 @@ def train_reconstruction(
     task = lessons.task(physics, options.seed)
     trained = train(task, made.network, options, callback=callback)
     # The arrays of a state that was read are NumPy's.
-    whole_model = dataclasses.replace(made, network=jax.tree.map(jnp.asarray, trained.model))
+    network, part = tempered(jax.tree.map(jnp.asarray, trained.model), task.validation)
+    whole_model = dataclasses.replace(made, network=network)
+    if path is not None:
+        whole_model.save(path.with_name(NETWORK), {**record, **trained.state.record, "part": part})
     return Trained(whole_model, trained.state, trained.status)
+
+
+def tempered(network: UNet, judged: Sequence[PreparedExamples]) -> tuple[UNet, float]:
+    """The network that adds the part of its output that suits examples best, and that part."""
+
+    def adding(part: float) -> UNet:
+        leave = jax.tree.map(lambda leaf: jnp.asarray(part, leaf.dtype) * leaf, network.leave)
+        return eqx.tree_at(lambda one: one.leave, network, leave)
+
+    score = eqx.filter_jit(lambda one, given: loss(one, given)[0])
+    scores = {p: np.mean([float(score(adding(p), one)) for one in judged]) for p in _PARTS}
+    best = min(scores, key=lambda part: scores[part])
+    return adding(best), best
 
 
 def gains(
