@@ -41,7 +41,8 @@ from thincam_jax.studies.prepared import pixel_noise, prepared_recording
 
 SEED, WARM = 4242, 100
 LESS = "AdmmTV(tau=0.5)"
-HIDDEN = (LESS,)  # in the pictures
+REFINED = {f"{name}, refined": name for name in ("AdmmTV", "pnp", "trained")}
+HIDDEN = (LESS, *REFINED)  # in the pictures
 
 
 def draw(rows, path):
@@ -90,9 +91,12 @@ def compare(camera, methods, count, seed):
         top, left = ((n - m) // 2 for n, m in zip(scene.shape[1:], camera.sensor, strict=True))
         truth = scene[:, top : top + rows, left : left + columns]
         images = {"truth": truth[0], "capture": np.asarray(recording.captures[0])[0]}
+        began = time.process_time()
+        mended = tc.refine(recording, parameters=("scale", "turn")).recording
+        refining = time.process_time() - began
         for name, method in methods.items():
-            began = time.process_time()
-            image = image_of(recording, name, method, camera.sensor)
+            began = time.process_time() - refining * (name in REFINED)
+            image = image_of(mended if name in REFINED else recording, name, method, camera.sensor)
             seconds = time.process_time() - began
             found = agreement(image, truth)
             scores[name].append((found.psnr_db, found.ssim, seconds))
@@ -228,6 +232,7 @@ def main():
         "pnp": tc.PlugAndPlay(),
         "trained": trained,
     }
+    methods |= {name: methods[plain] for name, plain in REFINED.items()}
     scores, shown = compare(camera, methods, given.count, given.seed)
     reference = np.asarray([one[0] for one in scores["AdmmTV"]])
     print("| method | PSNR, dB | gain over AdmmTV, dB | least gain | SSIM | CPU s |")
@@ -240,10 +245,12 @@ def main():
             f"| {name} | {decibels.mean():.2f} | {gain.mean():+.2f} ± {half:.2f} | "
             f"{gain.min():+.2f} | {similar.mean():.3f} | {np.median(seconds):.1f} |"
         )
-    scored = (np.asarray([one[0] for one in scores[name]]) for name in ("trained", "pnp"))
-    beside = np.subtract(*scored)
-    half = stats.t.ppf(0.975, len(beside) - 1) * stats.sem(beside)
-    print(f"trained less pnp: {beside.mean():+.2f} ± {half:.2f}, least {beside.min():+.2f}")
+    for name, other in {"trained": "pnp", **REFINED}.items():
+        beside = np.asarray(
+            [one[0] - two[0] for one, two in zip(scores[name], scores[other], strict=True)]
+        )
+        half = stats.t.ppf(0.975, len(beside) - 1) * stats.sem(beside)
+        print(f"{name} less {other}: {beside.mean():+.2f} ± {half:.2f}, least {beside.min():+.2f}")
     order = np.argsort(np.asarray([one[0] for one in scores["trained"]]) - reference)
     chosen = [shown[order[place]] for place in (0, len(order) // 2, -1)]
     draw(chosen, given.out / "trained-simulated.png")

@@ -9,28 +9,28 @@ import pytest
 import scipy
 
 import thincam_jax as tc
-from thincam_jax.reconstruction.refinement import _moved, _Search, _unknowns, changed_psf
+from thincam_jax.reconstruction.refinement import _block, _moved, _Search, _unknowns, changed_psf
 from thincam_jax.units import nm, um
 
 SHAPE = (48, 64)
 
 
-def spots(*, scale=1.0, turn=0.0, shift=(0.0, 0.0), seed=0):
-    """Gaussian spots, turned anticlockwise (y points down), of unit sum."""
-    generator = np.random.default_rng(seed)
-    y, x = (generator.uniform(-0.3, 0.3, 40) * n * scale for n in SHAPE)
+def spots(*, scale=1.0, turn=0.0, shift=(0.0, 0.0), seed=0, size=1):
+    """Gaussian spots, turned anticlockwise (y points down), of unit sum; `size` times as large."""
+    generator, shape = np.random.default_rng(seed), [size * n for n in SHAPE]
+    y, x = (generator.uniform(-0.3, 0.3, 40) * n * scale for n in shape)
     y, x = y * np.cos(turn) - x * np.sin(turn), y * np.sin(turn) + x * np.cos(turn)
+    width = 1.2 * scale * size
     rows, columns = (
-        np.exp(
-            -((np.arange(n)[:, None] - (n - 1) / 2 - place - move) ** 2) / (2 * (1.2 * scale) ** 2)
-        )
-        for n, place, move in zip(SHAPE, (y, x), shift, strict=True)
+        np.exp(-((np.arange(n)[:, None] - (n - 1) / 2 - place - move) ** 2) / (2 * width**2))
+        for n, place, move in zip(shape, (y, x), shift, strict=True)
     )
     psf = (rows * generator.exponential(1, 40)) @ columns.T
     return psf / psf.sum()
 
 
 def scene(seed):
+    """Rectangles on black."""
     generator = np.random.default_rng(seed)
     image = np.zeros([2 * n - 1 for n in SHAPE])
     for _ in range(25):
@@ -42,8 +42,11 @@ def scene(seed):
 
 def seen(psfs, seed=1):
     """Captures of a scene, with noise and an unknown background."""
-    operators = tc.Recording(np.ones((len(psfs), *SHAPE)), tc.Psfs(psfs)).problem().operators
-    clean = np.stack([np.asarray(o(jnp.asarray(scene(seed)[None, None])))[0] for o in operators])
+    operators = tc.Recording(np.ones(psfs.shape), tc.Psfs(psfs)).problem().operators
+    image = np.kron(scene(seed), np.ones([psfs.shape[-1] // SHAPE[1]] * 2))
+    rows, columns = operators[0].field_shape
+    image = np.pad(image, [(0, rows - len(image)), (0, columns - len(image[0]))])
+    clean = np.stack([np.asarray(o(jnp.asarray(image[None, None])))[0] for o in operators])
     noise = 0.01 * clean.std() * np.random.default_rng(seed).normal(size=clean.shape)
     return clean + 0.1 * clean.max() + noise
 
@@ -71,6 +74,19 @@ def test_scale_and_turn_are_mended(capture):
         _Search(r, 0.5, [], None).residual(np.empty(0), None, 400) for r in (held_out, better)
     )
     assert np.sum(after**2) < 0.8 * np.sum(before**2)
+
+
+@pytest.mark.thorough
+def test_large_captures_are_refined_on_blocks_of_pixels():
+    """The numbers are in pixels of the captures."""
+    right, wrong = spots(size=4), spots(size=4, scale=0.98, turn=-0.006)
+    recording = tc.Recording(seen(right[None]), tc.Psfs(wrong[None]))
+    assert _Search(recording, 0.5, [], None, _block(recording)).captures[0].shape == (1, 96, 128)
+    found = tc.refine(recording)
+    for name, value in (("scale", 1 / 0.98), ("turn", 0.006)):
+        assert abs(found.values[name] - value) < 3 * found.errors[name] < 0.01
+    better = found.recording.imaging_model.psfs[0, 0, 0]
+    assert np.linalg.norm(better - right) < 0.2 * np.linalg.norm(wrong - right)
 
 
 @pytest.mark.thorough
@@ -107,6 +123,14 @@ def test_a_camera_from_afar_tells_no_object_distance():
     endless = replace(recording, imaging_model=replace(optics, object_distance=np.inf))
     found = tc.refine(endless, parameters=["object_distance"])
     assert found.undetermined == {"object_distance": "it is infinite"}
+
+
+def test_blocks_leave_enough_pixels_and_detail():
+    grain = np.random.default_rng(0).random((1, 192, 256))
+    sizes = (spots(size=4)[None], 2), (grain, 1), (spots(size=4)[None, :80], 1), (spots()[None], 1)
+    for psf, size in sizes:
+        recording = tc.Recording(np.ones(psf.shape), tc.Psfs(psf), noise_variance=1.0)
+        assert _block(recording) == size
 
 
 def test_changed_psfs_are_those_of_the_pattern():

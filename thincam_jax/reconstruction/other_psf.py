@@ -26,7 +26,7 @@ from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.smooth_misfit import misfit_of
 
 TURN = "turn the PSF or the captures"
-RESIZE = "refine it (thincam calibrate check --refine), or the cameras' distance"
+RESIZE = "refine it (--refine, in Python tc.refine), or the cameras' distance"
 _FIT = "the captures fit far better a PSF that"
 MIRRORED = {"upside down": (-2,), "mirrored left to right": (-1,), "turned by 180°": (-2, -1)}
 NEGATIVE = "the captures fit far better inverted; give full scale minus captures, as 255 - captures"

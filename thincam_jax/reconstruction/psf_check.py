@@ -16,6 +16,7 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum
 from thincam_jax._core.progress import watched
+from thincam_jax.reconstruction.coarse import coarser
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
@@ -233,33 +234,48 @@ def check_psf(
     )
 
 
-def blocks_blur(psf: Float[np.ndarray, "*batch k l"], block: int) -> bool:
-    """Whether blocks of twice that side lose a fifth of the PSF's variance that these blocks keep.
+def blocks_blur(psf: Float[np.ndarray, "*batch k l"], block: int, least: float = _KEPT) -> bool:
+    """Whether blocks of twice that side keep less than a part of what these do of the variance.
 
-    Scales found with such blocks are up to four times less accurate than with all detail.
+    Below 0.8 scales found by `check_psf` are up to four times less accurate than with all detail.
     """
     rows, columns = (n // (2 * block) * 2 * block for n in psf.shape[-2:])
     kept = block_mean(psf[..., :rows, :columns], block)
-    return bool(np.var(block_mean(kept, 2)) < _KEPT * np.var(kept))
+    return bool(np.var(block_mean(kept, 2)) < least * np.var(kept))
+
+
+def on_blocks(problem: InverseProblem, size: int) -> InverseProblem | None:
+    """The problem on larger pixels; None where `coarser` has none."""
+    blank = jnp.zeros(problem.image_shape, problem.captures[0].dtype)
+    found = coarser(problem, blank, size)
+    return None if found is None else found[0]
 
 
 class Trials:
-    """Problems of other imaging models, with the weights and the unit of τ of the one given."""
+    """Problems of other imaging models, with the weights and the unit of τ of the one given.
 
-    def __init__(self, recording: Recording, tau: float):
-        self.recording, self.tau = recording, tau
-        problem = recording.problem(tau=tau)
-        self.weights, self.tau_unit = problem.weights, problem.tau_unit
-        pairs = zip(problem.weights, problem.captures, strict=True)
+    - `size`: side of the blocks of pixels that are averaged; 1, or one that `coarser` takes.
+    """
+
+    def __init__(self, recording: Recording, tau: float, size: int = 1):
+        self.recording, self.tau, self.size = recording, tau, size
+        given = recording.problem(tau=tau)
+        self.weights, self.tau_unit = given.weights, given.tau_unit
+        coarse = self._coarse(given)
+        self.captures = coarse.captures
+        pairs = zip(coarse.weights, self.captures, strict=True)
         self.pixels = sum(int(np.count_nonzero(np.broadcast_to(w, c.shape))) for w, c in pairs)
-        self.block = max(4, max(recording.captures[0].shape[-2:]) // _BLOCKS)
+        self.block = max(4, max(self.captures[0].shape[-2:]) // _BLOCKS)
 
     def problem(self, model: Psfs | Cameras) -> InverseProblem:
         """The problem of another imaging model."""
         problem = replace(self.recording, imaging_model=model).problem(tau=self.tau)
-        return eqx.tree_at(
-            lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
-        )
+        known = self.weights, self.tau_unit
+        return self._coarse(eqx.tree_at(lambda p: (p.weights, p.tau_unit), problem, known))
+
+    def _coarse(self, problem: InverseProblem) -> InverseProblem:
+        found = None if self.size == 1 else on_blocks(problem, self.size)
+        return problem if found is None else found
 
     def blocks(self, values: Numbers) -> Float[np.ndarray, "*batch block"]:
         """Sums over blocks of pixels."""

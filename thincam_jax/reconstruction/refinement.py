@@ -19,12 +19,15 @@ from thincam_jax.reconstruction.imaging_model import Cameras, Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import residuals
-from thincam_jax.reconstruction.psf_check import Trials, resampled, searched
+from thincam_jax.reconstruction.psf_check import Trials, blocks_blur, on_blocks, resampled, searched
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.solver import first_image
 from thincam_jax.reconstruction.splittings import admm_method
 
+# Pixels of the longer side, at least, that the blocks of a large capture leave, and the part of the
+# PSF's variance that blocks keep without which these are half as large.
+_SIDE, _KEPT = 100, 0.75
 # Iterations from a black image, from the image of a model nearby, and where only a rough idea is
 # needed. Fewer than 200 from black move scales by up to 0.7 %.
 _COLD, _NEARBY, _WARM = 400, 200, 60
@@ -35,7 +38,9 @@ _ENDED = 0.1  # of a step of the differences
 _DETERMINED = (
     1 / 3
 )  # of the range searched: the largest standard error of a number that is determined
-_SIGNIFICANCE = 2.0  # standard errors by which hidden pixels must be predicted better
+# Standard errors by which hidden pixels must be predicted better, and by what part of the squared
+# residual: with less images gain nothing, and a wrong scale may cost a decibel.
+_SIGNIFICANCE, _LEAST_GAIN = 2.0, 0.01
 
 _TURN, _SHIFT, _BLUR = 0.035, 3.0, 1.0  # ranges searched: rad, pixels, pixels²
 # Standard error of a blur at the least, pixels²: total variation blurs, a sharper PSF undoes it.
@@ -48,7 +53,7 @@ class Refinement:
     """Result of `refine`.
 
     - `recording`: the one given with the refined PSFs or cameras, its `imaging_model`. It is the
-      one given where hidden pixels are not predicted better by two standard errors.
+      one given where hidden pixels are not predicted better by two standard errors and 1 %.
     - `values`, `errors`, `units`: numbers that fit best and their standard errors. `scale` is that
       of the PSF that fits over the one given, `turn` is anticlockwise in rad, `blur` the variance
       in pixels² to add, `shift_y 2` that of the second PSF against the first in pixels. Distances
@@ -69,12 +74,16 @@ class Refinement:
     def __str__(self) -> str:
         """Residuals, numbers with their errors, and a line for each number left as given."""
         lines = [f"residual of hidden pixels {self.noise_ratio_before:.3f} times the noise"]
-        for name, value in self.values.items():
-            error, unit = self.errors[name], self.units[name]
-            lines.append(f"{name} {value:.5g} ± {error:.2g} {unit}".rstrip())
+        lines += self.numbers
         lines += [f"{name}: {reason}" for name, reason in self.undetermined.items()]
         last = f"refined {self.noise_ratio:.3f} times" if self.is_changed else "unchanged"
         return "\n".join([*lines, last])
+
+    @property
+    def numbers(self) -> list[str]:
+        """Numbers with their errors and units, in words."""
+        found = ((value, self.errors[n], self.units[n], n) for n, value in self.values.items())
+        return [f"{n} {value:.5g} ± {error:.2g} {unit}".rstrip() for value, error, unit, n in found]
 
 
 @dataclass(frozen=True)
@@ -134,9 +143,9 @@ def refine(
 
     **Arguments**
 
-    - `recording`: captures of at least 32 pixels a side with `Psfs` or `Cameras`. Average blocks
-      of pixels until the longer side is 100 to 200; as many iterations as 30 to 100 reconstructions
-      are made.
+    - `recording`: captures of at least 32 pixels a side with `Psfs` or `Cameras`. Of those with
+      PSFs blocks of pixels are averaged until the longer side has 100 to 200, twice as many where
+      that would blur the PSF; give few pixels with cameras. 30 to 100 reconstructions are made.
     - `parameters`: names of the above; default all.
     - `search`: range of scale and distances about those given, at most 0.2.
     - `tau`: weight of total variation, relative to the noise; see `AdmmTV`.
@@ -167,13 +176,14 @@ def refine(
     names = possible if parameters is None else tuple(parameters)
     if not names or not set(names) <= set(possible):
         raise ValueError(f"parameters = {list(names)}; give some of {', '.join(possible)}")
-    unknowns, reasons = _unknowns(model, names, search)
-    work = _Search(recording, float(tau), unknowns, callback)
+    size = _block(recording)
+    unknowns, reasons = _unknowns(model, names, search, size)
+    work = _Search(recording, float(tau), unknowns, callback, size)
     before = _Fit(work.given, np.zeros(0), work.residual(work.given, None, _COLD))
     active = [k for k, step in enumerate(work.steps) if step > 0]
     for k in set(range(len(unknowns))).difference(active):
         reasons[unknowns[k].name] = "the PSF hardly depends on it"
-    start = work.coarse(2 / max(shape)) if "scale" in names else work.given
+    start = work.coarse(2 * size / max(shape)) if "scale" in names else work.given
     fit = before
     while active:
         fit = work.fit(start, active)
@@ -186,7 +196,8 @@ def refine(
         del active[worst]
         fit = before
     gains = work.blocks(before.residual**2 - fit.residual**2).ravel()
-    better = bool(np.sum(gains) > _SIGNIFICANCE * math.sqrt(gains.size) * np.std(gains) > 0)
+    least = _SIGNIFICANCE * math.sqrt(gains.size) * np.std(gains)
+    better = bool(np.sum(gains) > max(least, _LEAST_GAIN * np.sum(before.residual**2)))
     if better:
         recording = replace(recording, imaging_model=work.model(fit.values))
     found = [unknowns[k].name for k in active]
@@ -202,13 +213,14 @@ def refine(
 class _Search(Trials):
     """Residuals of hidden pixels at any numbers, and their least squares."""
 
-    def __init__(self, recording: Recording, tau: float, unknowns: list[_Unknown], callback):
-        super().__init__(recording, tau)
+    def __init__(
+        self, recording: Recording, tau: float, unknowns: list[_Unknown], callback, size: int = 1
+    ):
+        super().__init__(recording, tau, size)
         self.unknowns, self.callback, self.done = unknowns, callback, 0
         self.given = np.array([u.given for u in unknowns])
         generator = np.random.default_rng(0)
-        captures = recording.problem().captures
-        masks = [generator.random(c.shape) < 0.5 for c in captures]
+        masks = [generator.random(c.shape) < 0.5 for c in self.captures]
         self.halves = masks, [~mask for mask in masks]
         self.images: list[Image] = []
 
@@ -230,13 +242,13 @@ class _Search(Trials):
         schedule = Schedule(iterations, 1e-6, adapt_until=iterations // 2)
         found, self.images = [], []
         for number, masks in enumerate(self.halves):
-            pairs = zip(self.weights, masks, strict=True)
+            pairs = zip(problem.weights, masks, strict=True)
             weights = tuple(w * m.astype(w.dtype) for w, m in pairs)
             half = eqx.tree_at(lambda p: p.weights, problem, weights)
             first = first_image(half, None, uniform=False) if starts is None else starts[number]
             image = iterate(in_parallel(half, admm_method), first, schedule).image
             missing = _residuals(half, image)
-            parts = zip(self.weights, masks, missing, strict=True)
+            parts = zip(problem.weights, masks, missing, strict=True)
             hidden = [np.where(m, 0, np.sqrt(w) * np.asarray(r, float)) for w, m, r in parts]
             found.append(np.concatenate([h.reshape(-1, *h.shape[-2:]) for h in hidden]))
             self.images.append(image)
@@ -292,7 +304,7 @@ class _Search(Trials):
         rough, fine = (self.residual(values, images, _NEARBY, self.tau * f) for f in (2, 0.5))
         by_tau = inverse @ (slopes @ (rough - fine).ravel()) / 2
         is_blur = np.array([self.unknowns[k].name == "blur" for k in active])
-        variance = np.diag(covariance) + by_tau**2 + _BLUR_ERROR**2 * is_blur
+        variance = np.diag(covariance) + by_tau**2 + (_BLUR_ERROR * self.size**2 * is_blur) ** 2
         return _Fit(values, np.sqrt(variance), residual)
 
     def doubt(self, fit: _Fit, active: list[int]) -> tuple[int, str]:
@@ -326,10 +338,23 @@ class _Search(Trials):
 _residuals = eqx.filter_jit(residuals)
 
 
+def _block(recording: Recording) -> int:
+    """Side of the blocks that leave enough pixels, or twice as many where these blur the PSF.
+
+    One pixel for computed cameras.
+    """
+    model, side = recording.imaging_model, max(recording.captures[0].shape[-2:])
+    if not isinstance(model, Psfs):
+        return 1
+    fine, coarse = (max(1, side // pixels) for pixels in (2 * _SIDE, _SIDE))
+    size = fine if blocks_blur(np.asarray(model.psfs), fine, _KEPT) else coarse
+    return size if size == 1 or on_blocks(recording.problem(), size) is not None else 1
+
+
 def _unknowns(
-    model: Psfs | Cameras, names: tuple[str, ...], search: float
+    model: Psfs | Cameras, names: tuple[str, ...], search: float, size: int = 1
 ) -> tuple[list[_Unknown], dict[str, str]]:
-    """The numbers to find, and those that cannot be."""
+    """The numbers to find, and those that cannot be; `size`: side of the blocks of pixels."""
     if isinstance(model, Cameras):
         furthest, focus = _distances(model)
         possible = [
@@ -340,11 +365,11 @@ def _unknowns(
         possible = [
             _Unknown("scale", "", 1.0, search),
             _Unknown("turn", "rad", 0.0, _TURN),
-            _Unknown("blur", "pixels²", 0.0, _BLUR),
+            _Unknown("blur", "pixels²", 0.0, _BLUR * size**2),
         ]
         numbers = range(2, model.count + 1)
         shifts = [f"shift_{axis} {number}" for number in numbers for axis in "yx"]
-        possible += [_Unknown(name, "pixels", 0.0, _SHIFT) for name in shifts]
+        possible += [_Unknown(name, "pixels", 0.0, _SHIFT * size) for name in shifts]
     wanted = [u for u in possible if u.name.startswith(names)]
     reasons = {u.name: "it is infinite" for u in wanted if not math.isfinite(u.given)}
     if "shift" in names and model.count == 1:

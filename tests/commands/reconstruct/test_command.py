@@ -357,16 +357,48 @@ def check(paths, *more, psf="psf"):
     return runner.invoke(cli.app, ["calibrate", "check", *map(str, given), *map(str, more)])
 
 
-@pytest.mark.thorough
-def test_a_refined_psf_is_written_and_can_be_used(grey, tmp_path):
-    """One that was measured 3 % too small."""
-    small = tmp_path / "small.tif"
+@pytest.fixture
+def small(grey, tmp_path):
+    """The files, with a PSF that was measured 3 % too small."""
+    grey["small"] = tmp_path / "small.tif"
     light = tifffile.imread(grey["psf"]).astype(float)
     middle = (np.array(light.shape) - 1) / 2
     start = middle - middle / 0.97
     shrunk = scipy.ndimage.affine_transform(light, [1 / 0.97] * 2, start, mode="nearest")
-    tifffile.imwrite(small, np.round(shrunk).clip(0, 4095).astype(np.uint16))
-    grey["small"], out = small, tmp_path / "refined.tif"
+    tifffile.imwrite(grey["small"], np.round(shrunk).clip(0, 4095).astype(np.uint16))
+    return grey
+
+
+@pytest.mark.thorough
+def test_a_psf_of_another_size_is_refined_as_advised(small, tmp_path):
+    """By `thincam reconstruct --refine`; a right one stays."""
+    more, truth = ("--bits", 12, "--background", small["dark"]), simulated.scene()[1]
+    given, refined, right = (tmp_path / f"{name}.npy" for name in ("given", "refined", "right"))
+    result = call(small, given, *more, psf="small")
+    assert "times the size; refine it (--refine" in result.stdout, result.output
+    result = call(small, refined, *more, "--refine", psf="small")
+    assert "; PSF refined: scale 1.03" in result.stdout, result.output
+    record = record_of(refined)
+    assert record["refinement"]["is_changed"] and not record["examination"]
+    assert abs(record["refinement"]["values"]["scale"] - 1 / 0.97) < 0.005
+    before, after = (simulated.correlation(np.load(one), truth) for one in (given, refined))
+    assert 1 - after < 0.7 * (1 - before)
+    assert "; PSF fits as it is" in call(small, right, *more, "--refine").stdout
+    assert not record_of(right)["refinement"]["is_changed"]
+
+
+def test_what_cannot_be_refined_is_told(grey, tmp_path):
+    line = one_line(call(grey, tmp_path / "a.png", "--refine", "--distances", "60mm,80mm,100mm"))
+    assert line.endswith("--refine is of one PSF; leave out --distances")
+    more = ("--refine", "--downsample", 2, "--bits", 12, "--background", grey["dark"])
+    assert "--refine: captures have (30, 38) pixels" in one_line(
+        call(grey, tmp_path / "a.png", *more)
+    )
+
+
+@pytest.mark.thorough
+def test_a_refined_psf_is_written_and_can_be_used(small, tmp_path):
+    grey, out = small, tmp_path / "refined.tif"
     bits = ("--bits", 12, "--downsample", 1)
     result = check(grey, *bits, "--refine", out, psf="small")
     assert result.exit_code == 0, result.output

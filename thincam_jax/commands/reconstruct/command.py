@@ -187,6 +187,9 @@ def reconstruct(
         ),
     ] = "sensor",
     flip: Annotated[bool, Option("--flip", help="Turn the image by 180°.")] = False,
+    refine: Annotated[
+        bool, Option("--refine", help="Correct the PSF's scale and rotation by each capture first.")
+    ] = False,
     linear: Annotated[
         Literal["npy", "tif", "none"],
         Option(help="Format of the linear image that is written beside a PNG."),
@@ -212,6 +215,7 @@ def reconstruct(
         from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
         from thincam_jax.commands.reconstruct.run import run_with_bar
+        from thincam_jax.measured import MeasurementError
 
         sources = options.Sources(
             options.known_psf(psf or (), camera, set_),
@@ -225,7 +229,9 @@ def reconstruct(
             options.read_exposures(exposure or (), len(psf or ()), len(capture)),
         )
         name, settings = options.read_method(method), vars(solver)
-        recipe = options.Recipe(name, field=field, flip=flip, **settings)
+        if refine and distances:
+            raise MeasurementError("--refine is of one PSF; leave out --distances")
+        recipe = options.Recipe(name, field=field, flip=flip, refine=refine, **settings)
         balance = options.read_white_balance(white_balance)
         ends = options.read_intervals(intervals, not distances, field)
         output = options.Output(out, linear, gamma, balance, ends)

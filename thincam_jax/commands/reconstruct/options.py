@@ -114,6 +114,7 @@ class Recipe:
     - `ridge`: strength of the method "ridge", which has neither tau nor coupling; None: 1.
     - `noise`: standard deviation of a raw pixel's noise, counts; None: estimated.
     - `strict`: severe findings of the examination are errors.
+    - `refine`: correct the PSF by each capture before its reconstruction.
 
     **Errors**: MeasurementError for what is unknown or out of range.
     """
@@ -127,6 +128,7 @@ class Recipe:
     ridge: float | int | None = None
     noise: float | int | None = None
     strict: bool = False
+    refine: bool = False
 
     def __post_init__(self):
         self._check_method()

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -125,6 +125,9 @@ def _run_job(
     _check_channels(job, ready, recipe, output)
     rig.tell(examined.findings, recipe.strict)
     noise = pixel_noise(ready, recipe.noise)
+    refinement, words = {}, ""
+    if recipe.refine:
+        ready, refinement, words = _refined(ready, noise)
     made = _reconstruct(job, ready, recipe, noise, report)
     rig.tell(() if made.doubt and not recipe.strict else made.findings, recipe.strict)
     findings = (*examined.findings, *made.findings)
@@ -136,6 +139,7 @@ def _run_job(
         "sources": _source_facts(rig.sources),
         "preparation": asdict(ready.log),
         "examination": [asdict(one) for one in findings],
+        **refinement,
         "reconstruction": made.record | {"noise": {"counts": noise.counts, "found": noise.found}},
         "image": {
             "shape": image.shape,
@@ -154,7 +158,19 @@ def _run_job(
         known = {"probability": intervals.probability, "pictures": intervals.pictures}
         record["intervals"] = {**known, "levels": intervals.levels, "mean_width": width}
     write_job(job, image, record, output, beside)
-    return replace(made, record=record, image=image, line=f"{job.images[0]}: {made.line}")
+    return replace(made, record=record, image=image, line=f"{job.images[0]}: {made.line}{words}")
+
+
+def _refined(ready: Prepared, noise: PixelNoise) -> tuple[Prepared, dict[str, Any], str]:
+    """The capture with its PSF refined, the record of that, and words for the line."""
+    with read_as("--refine"):
+        found = refine(prepared_recording(ready, noise), parameters=("scale", "turn"))
+    facts = {one.name: getattr(found, one.name) for one in fields(found) if one.name != "recording"}
+    if not found.is_changed:
+        return ready, {"refinement": facts}, "; PSF fits as it is"
+    psf = changed_psf(ready.psf, found.values)
+    words = f"; PSF refined: {', '.join(found.numbers)}"
+    return replace(ready, psf=psf), {"refinement": facts}, words
 
 
 def _ends(job: Job, ends: tuple[np.ndarray, np.ndarray]) -> tuple[dict[Path, bytes], float]:
