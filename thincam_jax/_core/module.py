@@ -81,7 +81,7 @@ class Module(AnyRank):
 
 
 def _near(made: Any, name: str) -> str:
-    """What to give in place of an argument that is unknown; it may be that of a part."""
+    """Name to give in place of an unknown argument; it may be that of a part."""
     names = list(inspect.signature(type(made)).parameters)
     for part in names:
         whole = getattr(made, part, None)
