@@ -12,11 +12,14 @@ _OTHERS = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "tex
 def photographs(count: int, field: tuple[int, int], mean: float = 0.4) -> np.ndarray:
     """Light (photograph, 2 y, 2 x) of the first sample images, cut to the field (y, x)."""
     names = [name for name in sample_images() if name not in _OTHERS][:count]
-    return np.stack([_cut(name, field, mean) for name in names]).astype(np.float32)
+    return np.stack(
+        [fitted(sample_image(name, linear=True), field, mean) for name in names]
+    ).astype(np.float32)
 
 
-def _cut(name: str, field: tuple[int, int], mean: float) -> np.ndarray:
-    image = np.atleast_3d(sample_image(name, linear=True)).mean(-1)
+def fitted(image: np.ndarray, field: tuple[int, int], mean: float = 0.4) -> np.ndarray:
+    """The middle of an image, in twice the field's pixels."""
+    image = np.atleast_3d(image).mean(-1)
     high, wide = (round(min(np.divide(image.shape, field)) * n) for n in field)
     top, left = (image.shape[0] - high) // 2, (image.shape[1] - wide) // 2
     image = resize(image[top : top + high, left : left + wide], (2 * field[0], 2 * field[1]))

@@ -28,6 +28,7 @@ def test_every_kind_by_its_best_member(found):
         assert all(np.max(np.abs(mask.amplitude)) <= 1 + 1e-6 for mask in one.masks)
         assert len(one.masks) == (4 if one.kind in ("fringe scanning", "method B") else 1)
         assert one.kind in str(found) and one.member in str(found)
+    assert str(found).startswith("Judged by PSFs on the axis")
 
 
 def test_errors_are_those_of_exact_psfs(found):

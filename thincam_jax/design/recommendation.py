@@ -72,7 +72,8 @@ class Recommendations(tuple[Recommendation, ...]):
     def table(self) -> Table:
         rows = [(r.kind, r.member, len(r.masks), r.decibels, r.evaluations) for r in self]
         headings = "masks", "best of them", "captures", "expected error, dB", "tried"
-        return Table(headings, rows, (0, 0, 2, 0), words=(1,))
+        title = "Judged by PSFs on the axis: off it, masks that focus lose more."
+        return Table(headings, rows, (0, 0, 2, 0), title, words=(1,))
 
     def __str__(self) -> str:
         return str(self.table())
@@ -105,7 +106,8 @@ def recommend(
     Some 120 members: two minutes for 512² cells before 1024² pixels. `find_cells` refines
     open and closed cells from there: `start=best.numbers`.
 
-    **Validity**: that of `find_cells`. Several depths are judged without refocusing.
+    **Validity**: that of `find_cells`. Several depths are judged without refocusing. PSFs are those
+    on the axis: off it masks that focus lose more, phase lenses most (docs/measured/atlas.md).
 
     **Errors**: ValueError for names of no kind.
 
