@@ -128,7 +128,7 @@ class TestExplain:
         assert rows["sensor.full_well: 13500.0"] == "default"
         assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
 
-    @but("design_slm", "design_distances", *STUDIES, *RIGS, "mosaic", "fza_superresolution")
+    @but(*DESIGNS[1:], *STUDIES, *RIGS, "mosaic", "fza_superresolution")
     def test_every_file(self, path, tmp_path):
         result = called("explain", path, *options_of(path, tmp_path))
         *values, work = result.stdout.splitlines()

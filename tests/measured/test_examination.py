@@ -8,6 +8,7 @@ import scipy.ndimage
 import scipy.signal
 
 import thincam_jax as tc
+from helpers import quick
 from thincam_jax.imaging.defects import stuck
 from thincam_jax.measured import Preparation, Raw, prepare
 from thincam_jax.measured.bayer import mosaic
@@ -186,7 +187,7 @@ def test_overexposed_psf():
     )
 
 
-@pytest.mark.parametrize("camera", ["spots", "coarse cells", "diffuser", "zones"])
+@pytest.mark.parametrize("camera", quick(["spots", "coarse cells", "diffuser", "zones"], 0, 3))
 def test_hot_pixels(camera):
     """15 in PSF and capture: within 0.3 dB of none, of those that matter."""
     true, light = scene(), CAMERAS[camera](SHAPE, 1)
@@ -295,7 +296,7 @@ def test_blocks_of_one_value(camera, value, level):
     np.testing.assert_array_equal(defective_pixels(Raw(image, 12)), expected)
 
 
-@pytest.mark.parametrize("camera", ["spots", "sharp spots", "diffuser"])
+@pytest.mark.parametrize("camera", quick(["spots", "sharp spots", "diffuser"], 1))
 def test_a_bright_block_in_a_psf(camera):
     """It is filled: within 0.3 dB, from up to 12. Spots that saturate are none."""
     true, light = scene(), CAMERAS[camera](SHAPE, 1)
