@@ -250,5 +250,18 @@ def test_a_screen_in_other_units(part, wrong):
         return wg.SeeThroughCamera(screen, tc.Sensor((44, 48), 48 * um), **lens)
 
     made()
-    with pytest.raises(ValueError, match=r"give it in mm|in mm$| mm$"):
+    with pytest.raises(ValueError, match="give it in mm|lengths in mm|is out of range; give"):
         made(**{part: wrong})
+
+
+def test_a_design_in_other_units():
+    def setup(pitch=40 * um, width=1.28, distance=100.0, across=40.0):
+        return tc.design.Setup(pitch, width, distance, across)
+
+    for wrong in ({"pitch": 40.0}, {"width": 1280.0 * 1e3}, {"distance": 0.1}, {"across": 4e4}):
+        with pytest.raises(ValueError, match="give (it|all) in mm"):
+            setup(**wrong)
+    with pytest.raises(ValueError, match="cell = 11.0 mm is no pixel: give it in mm"):
+        tc.design.CellMasks(11.0, 64, distance=6.5, wavelength=500 * nm)
+    with pytest.raises(ValueError, match="the least and the most in mm"):
+        tc.design.for_sensor(tc.Sensor((60, 80), 40 * um), distance=(0.003, 0.01))

@@ -137,7 +137,7 @@ class TestOverrides:
         ("override", "field", "part"),
         [
             ("sensor.pitch=5", "sensor.pitch", "5 has no unit"),
-            ("mask.widht=2 mm", "mask.widht", "unknown key; allowed here: width, profile"),
+            ("mask.widht=2 mm", "mask.widht", "did you mean 'width'?"),
             ("seed=", "seed", "null: input should be a valid integer"),
             ("noise.snr_db=none", "noise.snr_db", "for none write null"),
             ("noise=", "methods[1].kind", "give a 'noise' section"),

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Real
 
-from thincam_jax._core.text import nearest, shortened
+from thincam_jax._core.text import meant, shortened
 
 # What users give: checked below, which tells a wrong value in one line, and not by its type.
 if TYPE_CHECKING:
@@ -384,9 +384,8 @@ def choice(name: str, value: Any, options: Iterable[str]) -> str:
     options = tuple(options)
     if not isinstance(value, str) or value not in options:
         listed = ", ".join(repr(o) for o in options)
-        near = nearest(value, options) if isinstance(value, str) else []
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"{name} = {shown(value)} is unknown; choose one of {listed}{hint}")
+        able = f"choose one of {listed}{meant(value, options)}"
+        raise ValueError(f"{name} = {shown(value)} is unknown; {able}")
     return value
 
 

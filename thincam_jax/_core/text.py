@@ -36,6 +36,12 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
     return [plain[one] for one in difflib.get_close_matches(given, plain)]
 
 
+def meant(given: object, known: Iterable[str]) -> str:
+    """The end of a message: what a text that is not known may have been meant for."""
+    near = nearest(given, known) if isinstance(given, str) else []
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
 def slug(name: str) -> str:
     """A name as a file name."""
     return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-._") or "unnamed"

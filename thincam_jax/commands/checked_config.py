@@ -1,12 +1,13 @@
 """Checked sections of an experiment file's text, with a line for every fault, and back."""
 
+import re
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import pydantic
 import yaml
 
-from thincam_jax._core.text import shortened, spelled
+from thincam_jax._core.text import meant, shortened, spelled
 from thincam_jax.commands.config_file import ConfigError, Places, override, read_raw
 from thincam_jax.commands.sections import ExperimentConfig
 
@@ -100,11 +101,15 @@ def _message(error: Any, location: tuple, model: Any) -> str:
     """Fault and allowed values, in the words of an experiment file."""
     kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
     if kind == "extra_forbidden":
-        return f"unknown key; allowed here: {', '.join(_allowed(location[:-1], model))}"
+        allowed = _allowed(location[:-1], model)
+        return f"unknown key; allowed here: {', '.join(allowed)}{meant(location[-1], allowed)}"
     if kind == "missing" and isinstance(location[-1], int):
         return "missing; the list needs this entry"
     if kind == "literal_error":
-        return f"{_short(given)} is unknown; choose one of {context['expected']}"
+        able = re.findall(r"'([^']*)'", context["expected"])
+        return (
+            f"{_short(given)} is unknown; choose one of {context['expected']}{meant(given, able)}"
+        )
     if kind in ("too_short", "too_long"):
         limit = context.get("min_length", context.get("max_length"))
         word = "at least" if kind == "too_short" else "at most"

@@ -8,7 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax._core.text import slug
+from thincam_jax._core.text import meant, slug
 from thincam_jax.commands.config_file import ConfigError, Places
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.schema import (
@@ -186,8 +186,8 @@ class TargetConfig(Section):
     def _fits(self):
         check_keys(self, image="photograph", path="file")
         if self.image is not None and self.image not in sample_images():
-            listed = ", ".join(sample_images())
-            raise ValueError(f"image {self.image!r} is unknown; choose one of {listed}")
+            able = f"{', '.join(sample_images())}{meant(self.image, sample_images())}"
+            raise ValueError(f"image {self.image!r} is unknown; choose one of {able}")
         return self
 
 
@@ -310,7 +310,8 @@ class StudyConfig(CamerasConfig):
 def check_known(name: str, what: str, names: Sequence[str], *place: Any) -> None:
     """Refuse a name that a list does not have."""
     if name not in names:
-        raise FieldError(f"{name!r} is no {what}; choose one of {', '.join(names)}", *place)
+        able = f"{', '.join(names)}{meant(name, names)}"
+        raise FieldError(f"{name!r} is no {what}; choose one of {able}", *place)
 
 
 def check_names(config: ExperimentConfig, *lists: str) -> None:

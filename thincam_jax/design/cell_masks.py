@@ -67,7 +67,7 @@ class CellMasks(Module):
     **See also**: `cell_search.find_cells`.
     """
 
-    cell: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    cell: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.pixel_pitch))
     count: int = eqx.field(converter=whole(2, 4096), static=True)
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True), kw_only=True)
     wavelength: Float[Array, ""] = eqx.field(

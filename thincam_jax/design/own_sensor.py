@@ -114,7 +114,7 @@ def for_sensor(
     **See also**: `find_designs`, `DesignSpace`.
     """
     nearest, farthest = map(float, distance)
-    if not 0 < nearest < farthest < math.inf:
+    if not float(sensor.pitch) < nearest < farthest < math.inf:
         raise ValueError(
             f"distance = {distance}: give the least and the most in mm, such as (3, 10)"
         )

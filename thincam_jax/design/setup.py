@@ -123,6 +123,10 @@ def _prior(given: PowerLaw | None) -> PowerLaw:
     return PowerLaw() if given is None else given
 
 
+# Pixels along a sensor, and an object's width over its distance: what must be m or µm is refused.
+_MOST_PIXELS, _WIDEST = 1e5, 100.0
+
+
 @checked
 class Setup(Module):
     """A sensor before a scene of mean 1 and the variance `contrast`².
@@ -137,7 +141,7 @@ class Setup(Module):
       `thincam_jax.design.response`.
     """
 
-    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.pixel_pitch))
     sensor_width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     object_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     object_width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
@@ -148,6 +152,17 @@ class Setup(Module):
     prior: PowerLaw = eqx.field(default=None, converter=_prior)
     pixel_integration: bool = eqx.field(default=True, converter=bool, static=True)
     crop: bool = eqx.field(default=True, converter=bool, static=True)
+
+    def __check_init__(self):
+        if checks.holds_traced(self):
+            return
+        lengths = self.pitch, self.sensor_width, self.object_distance, self.object_width
+        pitch, sensor, distance, across = map(float, lengths)
+        if not (1.5 < sensor / pitch < _MOST_PIXELS and across / distance < _WIDEST):
+            raise ValueError(
+                f"sensor_width = {sensor:g} mm are {sensor / pitch:.3g} pixels, object_width = "
+                f"{across:g} mm is {across / distance:.3g} times object_distance; give all in mm"
+            )
 
     @property
     def field(self) -> Float[Array, ""]:

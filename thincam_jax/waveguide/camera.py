@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import quantity
+from thincam_jax._core.quantity import FieldError, quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index
 from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
@@ -109,9 +109,10 @@ class SeeThroughCamera(Module):
             return
         focal, wide = float(self.focal_distance), self.sensor.shape[1] * float(self.sensor.pitch)
         if not _NEAREST * wide < focal < _FURTHEST * wide:
-            raise ValueError(
+            raise FieldError(
                 f"focal_distance = {focal:g} mm: a sensor {wide:.3g} mm wide sees "
-                f"{2 * math.degrees(math.atan(wide / 2 / focal)):.3g}°; give lengths in mm"
+                f"{2 * math.degrees(math.atan(wide / 2 / focal)):.3g}°; give lengths in mm",
+                "focal_distance",
             )
 
     @property
