@@ -130,8 +130,11 @@ def test_from_captures_to_a_network_that_is_scored_on_others(home):
     gains = {one["method"]: one["beside"] for one in metrics(home / "scores")}
     assert [*gains] == ["admm_tv", "whole", "camera", "both"]
     assert all(gains[name]["half"] > 0 for name in ("whole", "camera", "both"))
+    # All that the camera's network adds loses 0.42 dB on another rig's scenes; judges keep half.
+    assert training_record(home / "camera.thincam")["part"] < 1
+    assert gains["camera"]["mean"] > -0.21
     # What pairs teach holds for captures held out, if a few of them teach little.
-    assert gains["both"]["mean"] > gains["camera"]["mean"] + 0.2
+    assert gains["whole"]["mean"] > gains["camera"]["mean"] + 0.08
 
 
 def metrics(folder):
