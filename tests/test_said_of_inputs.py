@@ -131,6 +131,13 @@ def of_files(psf, capture, **given):
     return np.asarray(result.image), result.reason
 
 
+def test_a_result_is_an_array_for_numpy():
+    psf, capture = light_of(spots)
+    result = tc.reconstruct(tc.Recording([capture], tc.Psfs(psf[None])), "ridge")
+    assert np.array_equal(np.asarray(result), np.asarray(result.image))
+    assert np.asarray(result, np.float16).dtype == np.float16 and np.mean(result).shape == ()
+
+
 def test_a_noise_that_is_too_large():
     """Without it the image is as good as it can be."""
     psf, capture = (image.astype(np.float32) - DARK for image in light_of(spots))

@@ -95,15 +95,24 @@ def _warn_of_units(camera: LenslessCamera, scene: Scene) -> None:
             SamplingWarning,
             stacklevel=4,
         )
+    warn_if_unseen(scene, float(camera.distance), float(camera.sensor.pitch), level=5)
+
+
+def warn_if_unseen(scene: Scene, distance: float, pitch: float, level: int = 3) -> None:
+    """SamplingWarning for pictures that a mask casts on less than a pixel.
+
+    - `distance`, `pitch`: distance of the mask and pitch of the pixels, mm.
+    """
     for plane in scene.planes:
-        cast = float(plane.width * camera.distance / plane.distance / camera.sensor.pitch)
+        far, width = float(plane.distance), float(plane.width)
+        cast = width * distance / far / pitch
         if cast < _TINY and min(plane.image.shape[-2:]) >= _PICTURE:
             warnings.warn(
-                f"the scene, {float(plane.width):g} mm wide at {float(plane.distance):g} mm, is "
-                f"cast {cast:.2g} pixels wide by a mask at {float(camera.distance):g} mm: none of "
-                "it is seen; give lengths in mm, or a wider scene",
+                f"the scene, {width:g} mm wide at {far:g} mm, is cast {cast:.2g} pixels wide by a "
+                f"mask at {distance:g} mm: none of it is seen; give lengths in mm, or a wider "
+                "scene",
                 SamplingWarning,
-                stacklevel=4,
+                stacklevel=level,
             )
 
 

@@ -1,10 +1,11 @@
 """Reconstructed images."""
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.module import Module
@@ -62,6 +63,10 @@ class Reconstruction(Module):
     def has_planes(self) -> bool:
         """Whether the images of several distances are known to be behind each other."""
         return self.pitch is not None and self.pitch.ndim > 0
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The image, for NumPy and what takes its arrays, such as `matplotlib.pyplot.imshow`."""
+        return np.array(self.image, dtype, copy=copy)
 
     def _repr_png_(self) -> bytes:
         """Figure for notebooks: axes in mm, sRGB; planes and a batch side by side."""

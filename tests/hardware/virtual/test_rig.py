@@ -25,6 +25,7 @@ from thincam_jax.hardware.virtual.optics import (
 from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig, pattern_number
 from thincam_jax.imaging.operators import Matrix, Sparse
 from thincam_jax.imaging.targets import usaf1951
+from thincam_jax.lensless.resolve import SamplingWarning
 from thincam_jax.units import nm, um
 
 SIDE, PITCH, BETA = 40, 36 * um, 40.0  # of the mask on the modulator
@@ -217,6 +218,13 @@ def test_what_the_virtual_camera_lacks_is_refused(settings, told):
         with pytest.raises(OutOfRange, match=told):
             camera.configure(settings)
         assert camera.trigger_and_grab(1.0).pixels.shape == (20, 30)
+        camera.configure(CameraSettings(10 * 1e-6))  # 10 us of a file, a rounding below 1e-5
+
+
+def test_a_mask_in_micrometres_is_said():
+    made = modulator()
+    with pytest.warns(SamplingWarning, match="none of it is seen; give lengths in mm"):
+        dataclasses.replace(made, distance=6.5e-3)
 
 
 def test_drivers_that_have_no_virtual_camera():

@@ -115,7 +115,7 @@ class VirtualCamera(Camera):
         if region.top + region.height > rows or region.left + region.width > columns:
             what = f"{region} lies outside of the sensor"
             raise self._refused(what, f"a part of {rows} × {columns}")
-        if not _LEAST <= settings.exposure <= _LONGEST:
+        if not _LEAST <= round(settings.exposure, 9) <= _LONGEST:  # 10 us are a bit less than 1e-5
             what = f"ExposureTime of {settings.exposure:g} s"
             raise self._refused(what, f"{_LEAST:g} … {_LONGEST:g} s")
         if settings.pixel_format not in BIT_DEPTHS:

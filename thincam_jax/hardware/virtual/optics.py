@@ -24,6 +24,7 @@ from thincam_jax.imaging.operators.crop_convolution import kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera, LightPath
+from thincam_jax.lensless.capture import warn_if_unseen
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.sampled import SampledMask
 from thincam_jax.lensless.method import pixel_nodes
@@ -99,6 +100,9 @@ class ModulatorOptics:
     phases: PhaseLevels | None = None
     aperture: tuple[int, int] | None = None
     stage: StageErrors = StageErrors()
+
+    def __post_init__(self):
+        warn_if_unseen(self.scene, self.distance, float(self.sensor.pitch))
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
