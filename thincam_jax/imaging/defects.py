@@ -279,7 +279,7 @@ def is_dark(image: np.ndarray, level: np.ndarray, side: int) -> bool:
     return bool((level - lowest <= _LIT * light).all())
 
 
-def pedestal(images: Float[np.ndarray, "*batch y x"]) -> tuple[float, float]:
+def pedestal(images: Shaped[np.ndarray, "*batch y x"]) -> tuple[float, float]:
     """Furthest level from 0 of images whose darkest corner is dark and uniform.
 
     With it, its part of the mean, of the light above where it is negative. Both are 0 where light
