@@ -309,7 +309,6 @@ CARDS = {
     "phase_mask": ("phase-masks.png", 800, 345, 162),
     "prior": ("prior.png", 1016, 48, 294),
     "real_capture": ("real-capture.png", 676, 52, 140),
-    "refined_cells": ("refined-cells.png", 404, 27, 266),
     "refocus": ("depth.png", 1032, 60, 150),
     "screen_distance": ("screen-distance.png", 702, 25, 293),
     "simulated_rig": ("rig.png", 707, 27, 280),

@@ -1,5 +1,4 @@
-"""Do cells that suit total variation beat linear ones?
-====================================================
+"""Whether cells that suit total variation beat linear ones: `python benchmarks/refined_cells.py`.
 
 `find_cells` searches for the least error of a linear image. Here its cells go on by the slope of
 another error, that of photographs as ADMM with total variation leaves them: through the captures,
@@ -10,6 +9,7 @@ run. A quarter of the thesis' sensor, in little light and in plenty. Lengths are
 
 import json
 import os
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
 from PIL import Image
-from tools.photographs import fitted, halved, photographs
 
 import thincam_jax as tc
 from thincam_jax.design import CellMasks, find_cells
@@ -32,10 +31,13 @@ from thincam_jax.reconstruction.problem import InverseProblem, uniform_image
 from thincam_jax.reconstruction.splittings import splitting_of
 from thincam_jax.units import nm, um
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
+from tools.photographs import fitted, halved, photographs
+
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "refined_cells"
 FIGURES.mkdir(parents=True, exist_ok=True)
-PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "shared/data/photographs"))
+PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
 
 # %%
 # Camera and photographs
