@@ -360,6 +360,7 @@ def resolve(
     chosen by default that are coarse or slow.
     """
     given = method = as_method(model, pixel_integration)
+    mask = mask.without_dark_margins()
     method = psf_method(mask, grid, sampled_off_axis(mask, grid, path, method))
     method = with_nodes(method, mask, grid, path)
     require_phase_sampling(mask, grid, path, method)

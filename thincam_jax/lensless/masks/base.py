@@ -56,6 +56,10 @@ class AbstractMask(Module):
         `wavelength`: mm, of the light; a mask whose transmittance is the same for all takes none.
         """
 
+    def without_dark_margins(self) -> "AbstractMask":
+        """The same transmittance by fewer cells, where those at the edges are known to be dark."""
+        return self
+
     @property
     def finest_frequency(self) -> Float[Array, ""] | float | None:
         """Highest spatial frequency of the mask, cycles/mm; None where it is not known."""
