@@ -57,7 +57,7 @@ class AbstractMask(Module):
         """
 
     def without_dark_margins(self) -> "AbstractMask":
-        """The same transmittance by fewer cells, where those at the edges are known to be dark."""
+        """Mask of the same transmittance and fewer cells, where those at its edges are dark."""
         return self
 
     @property

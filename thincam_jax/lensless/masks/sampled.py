@@ -160,7 +160,7 @@ class SampledMask(AbstractFactoredMask):
 
 
 def _lit_middle(lit: Bool[np.ndarray, " n"]) -> slice:
-    """The middle that is left of halving while it holds all that is lit."""
+    """Part in the middle that is left of halving while it holds all that is lit."""
     margin, count = 0, lit.size
     while lit.any() and (step := (count - 2 * margin) // 4):
         if lit[: margin + step].any() or lit[count - margin - step :].any():
