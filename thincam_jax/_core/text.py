@@ -42,6 +42,12 @@ def meant(given: object, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
+def one_of(given: object, known: Iterable[str]) -> str:
+    """Advice to choose one of the texts that are known, and which may have been meant."""
+    known = tuple(known)
+    return f"choose one of {', '.join(known)}{meant(given, known)}"
+
+
 def slug(name: str) -> str:
     """A name as a file name."""
     return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-._") or "unnamed"

@@ -213,7 +213,7 @@ def init(
 
         from thincam_jax._core.files import write_whole
         from thincam_jax._core.table import Table
-        from thincam_jax._core.text import meant
+        from thincam_jax._core.text import one_of
         from thincam_jax.commands.config_file import ConfigError, read_raw
 
         if example is None:
@@ -223,8 +223,7 @@ def init(
             say("next: thincam init EXAMPLE")
             return
         if example not in (*examples(), *_FILE_OF.values()):
-            able = f"{', '.join(examples())}{meant(example, examples())}"
-            raise ConfigError(f"init {example}: choose one of {able}")
+            raise ConfigError(f"init {example}: {one_of(example, examples())}")
         path = out or Path()
         path = path / f"{example}.yaml" if path.is_dir() else path
         own = sensor is not None or pitch is not None

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax._core.text import meant, spelled
+from thincam_jax._core.text import one_of, spelled
 from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment
 from thincam_jax.commands.terminal import (
     ConfigFile,
@@ -125,8 +125,7 @@ def schema(
         from thincam_jax.commands.config_file import ConfigError
 
         if kind not in KINDS:
-            able = f"{', '.join(KINDS)}{meant(kind, KINDS)}"
-            raise ConfigError(f"kind: {kind!r} is unknown; choose one of {able}")
+            raise ConfigError(f"kind: {kind!r} is unknown; {one_of(kind, KINDS)}")
         form = KINDS[kind].part(KINDS[kind].section).model_json_schema()
     say(json.dumps(form, indent=2))
 

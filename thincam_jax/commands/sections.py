@@ -8,7 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax._core.text import meant, slug
+from thincam_jax._core.text import one_of, slug
 from thincam_jax.commands.config_file import ConfigError, Places
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.schema import (
@@ -186,8 +186,8 @@ class TargetConfig(Section):
     def _fits(self):
         check_keys(self, image="photograph", path="file")
         if self.image is not None and self.image not in sample_images():
-            able = f"{', '.join(sample_images())}{meant(self.image, sample_images())}"
-            raise ValueError(f"image {self.image!r} is unknown; choose one of {able}")
+            able = one_of(self.image, sample_images())
+            raise ValueError(f"image {self.image!r} is unknown; {able}")
         return self
 
 
@@ -310,8 +310,7 @@ class StudyConfig(CamerasConfig):
 def check_known(name: str, what: str, names: Sequence[str], *place: Any) -> None:
     """Refuse a name that a list does not have."""
     if name not in names:
-        able = f"{', '.join(names)}{meant(name, names)}"
-        raise FieldError(f"{name!r} is no {what}; choose one of {able}", *place)
+        raise FieldError(f"{name!r} is no {what}; {one_of(name, names)}", *place)
 
 
 def check_names(config: ExperimentConfig, *lists: str) -> None:

@@ -126,7 +126,7 @@ class PlugAndPlay(AbstractIterativeSolver):
     - `denoiser`: "shipped", a file of `thincam train`, or a function of images (*batch, y, x) and
       their noise's deviation.
     - `strength`: σ relative to the one found; more gives smoother images, less leaves noise. Behind
-      a mask that focuses, photon noise is where the image is bright: 2 gains some 4 dB there.
+      a mask that focuses, bright places have most photon noise: 2 gains some 4 dB there.
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: weights of the captures, see `AdmmTV`.
     - `iterations`: data steps after the first one, in which s falls. Up to eight more follow

@@ -28,11 +28,12 @@ CODES = (
     "they are codes for a display (gamma), give raw frames, or (captures / 255) ** 2.2"
 )
 _POWER = 2.2
-# Noise where it is bright over that where it is dark, the standard deviation of a capture over its
-# noise, and the objective of what is decoded over that of what came in.
+# Limits of the noise of bright pixels over that of dark ones, of the contrast of a capture over its
+# noise, and of the objective of decoded captures over that of the captures as they are.
 _FALLING, _SEEN, _FITS_LESS = 0.85, 5.0, 1.5
 _EVEN, _CLEAR, _FITS = 1.2, 12.0, 1.2
 _COARSER = 2  # times twice as large
+_MOST = 2**_COARSER * LARGEST  # pixels of the field's shorter side; larger ones are not looked at
 
 
 def display_codes(recording: Recording) -> str:
@@ -40,8 +41,10 @@ def display_codes(recording: Recording) -> str:
     model = recording.imaging_model
     if not isinstance(model, Psfs) or holds_traced((model.psfs, recording.captures)):
         return ""
+    if model.field_shape is None and min(recording.captures[0].shape[-2:]) > _MOST:
+        return ""  # before a problem is made of large captures
     problem = recording.problem()
-    if problem.image_shape[-3] > 1 or min(problem.field_shape) > 2**_COARSER * LARGEST:
+    if problem.image_shape[-3] > 1 or min(problem.field_shape) > _MOST:
         return ""
     growth = noise_growth(problem)
     least, most = (_SEEN, _FITS_LESS) if growth < _FALLING else (_CLEAR, _FITS)
