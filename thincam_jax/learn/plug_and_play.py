@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core.precision import AccuracyWarning
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.learn.denoiser.network import SHIPPED, Denoiser
-from thincam_jax.learn.residual_noise import ResidualNoise, residual_noise
+from thincam_jax.learn.residual_noise import ResidualNoise, detail_variances, residual_noise
 from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Status
 from thincam_jax.reconstruction.normal_equations import (
     INNER_STEPS,
@@ -125,8 +125,7 @@ class PlugAndPlay(AbstractIterativeSolver):
 
     - `denoiser`: "shipped", a file of `thincam train`, or a function of images (*batch, y, x) and
       their noise's deviation.
-    - `strength`: σ relative to the one found; more gives smoother images, less leaves noise. Behind
-      a mask that focuses, bright places have most photon noise: 2 gains some 4 dB there.
+    - `strength`: σ relative to the one found; more gives smoother images, less leaves noise.
     - `nonnegative`: whether to constrain f ≥ 0.
     - `synthesis`: weights of the captures, see `AdmmTV`.
     - `iterations`: data steps after the first one, in which s falls. Up to eight more follow
@@ -289,8 +288,11 @@ class _Run:
         self._step(self.largest * (_FITTED if kind == "fitted" else self.course[0]))
         noise = self._noise()
         self.mistake = float(noise.mistake)
-        if bool(noise.grows):
-            self._weigh(noise.variances)
+        variances = noise.variances if bool(noise.grows) else ()
+        if not variances and not bool(noise.tells):
+            variances = detail_variances(self.problem)
+        if variances:
+            self._weigh(variances)
             self._step(self.s)
             noise = self._noise()
         self.precision = self.precision / noise.mistake**2

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
@@ -171,6 +172,18 @@ def demosaiced_noise(
     parts = [np.s_[:, i::2, j::2] for i in range(2) for j in range(2)]
     each = jnp.stack([estimate_noise(capture[part], valid[part]) for part in parts])
     return jnp.sqrt(jnp.mean(jnp.max(each, axis=0) ** 2))
+
+
+def details_by_light(
+    plane: Float[np.ndarray, "y x"], valid: Bool[np.ndarray, "y x"]
+) -> tuple[Float[np.ndarray, " detail"], Float[np.ndarray, " detail"]]:
+    """Mean light of 3×3 pixels, all valid, and their detail's size, the darkest first."""
+    detail = np.diff(np.diff(plane, 2, 0), 2, 1)
+    light = sliding_window_view(plane, (3, 3)).mean(axis=(-2, -1))
+    known = np.asarray(sliding_window_view(valid, (3, 3)).all(axis=(-2, -1)))
+    light, detail = light[known], np.abs(detail[known])
+    order = np.argsort(light)
+    return light[order], detail[order]
 
 
 def local_noise(capture: Float[Array, "..."], valid: Bool[Array, "..."]) -> Float[Array, "..."]:

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex
-from numpy.lib.stride_tricks import sliding_window_view
 
 from thincam_jax._core.checks import holds_traced
 from thincam_jax.reconstruction.backgrounds import light_of_uniform, with_other_background
 from thincam_jax.reconstruction.coarse import coarsened, finer
 from thincam_jax.reconstruction.iterate import Outcome
+from thincam_jax.reconstruction.noise import details_by_light
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, detector_shape
 from thincam_jax.reconstruction.psf_check import scaled_psf
 from thincam_jax.reconstruction.recording import Recording
@@ -153,13 +153,8 @@ def noise_growth(problem: InverseProblem) -> float:
         shape = -1, *capture.shape[-2:]
         known = np.broadcast_to(np.asarray(weight) > 0, capture.shape).reshape(shape)
         for plane, good in zip(np.asarray(capture).reshape(shape), known, strict=True):
-            inside = good & (plane > plane.min()) & (plane < plane.max())
-            detail, light = plane, plane
-            for axis in (0, 1):
-                detail = np.diff(detail, 2, axis)
-                light = sliding_window_view(light, 3, axis).mean(axis=-1)
-                inside = sliding_window_view(inside, 3, axis).all(axis=-1)
-            detail = np.abs(detail[inside])[np.argsort(light[inside])]
+            good = good & (plane > plane.min()) & (plane < plane.max())
+            _, detail = details_by_light(plane, good)
             quarter = detail.size // 4
             if quarter:
                 dark, bright = np.median(detail[:quarter]), np.median(detail[-quarter:])
