@@ -1,20 +1,29 @@
 """Photographs for designs: squares or rectangles of one brightness, in twice the field's pixels."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.imaging.targets.images import sample_images
+from thincam_jax.imaging.targets.images import load_image, sample_images
 
 # Drawings, and pictures that a design was tuned by.
 _OTHERS = "camera", "rocket", "coins", "cell", "cat", "colorwheel", "logo", "text"
 
 
 def photographs(count: int, field: tuple[int, int], mean: float = 0.4) -> np.ndarray:
-    """Light (photograph, 2 y, 2 x) of the first sample images, cut to the field (y, x)."""
+    """Light (photograph, 2 y, 2 x) of the first sample images, cut to the field (y, x).
+
+    More than these come from the folder `cc0` in that of THINCAM_PHOTOGRAPHS; without, they are
+    fewer. Codes of sample images are taken as light, those of the folder are decoded.
+    """
     names = [name for name in sample_images() if name not in _OTHERS][:count]
-    return np.stack(
-        [fitted(sample_image(name, linear=True), field, mean) for name in names]
-    ).astype(np.float32)
+    images = [sample_image(name, linear=True) for name in names]
+    if folder := os.environ.get("THINCAM_PHOTOGRAPHS"):
+        files = sorted(Path(folder, "cc0").glob("*.png"))
+        images += [load_image(file) for file in files[: count - len(images)]]
+    return np.stack([fitted(image, field, mean) for image in images]).astype(np.float32)
 
 
 def fitted(image: np.ndarray, field: tuple[int, int], mean: float = 0.4) -> np.ndarray:
