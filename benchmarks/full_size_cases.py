@@ -14,7 +14,6 @@ import resource
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,10 +23,9 @@ import numpy as np
 
 import thincam_jax as tc
 from thincam_jax.design import CellMasks, limit, recommend
-from thincam_jax.design.cell_masks import CellOptics, drawn_cells
-from thincam_jax.design.cell_search import CellSettings, _logarithm, _Problem
+from thincam_jax.design.cell_masks import drawn_cells
+from thincam_jax.design.cell_search import CellJudge, CellSettings, _logarithm, _Problem
 from thincam_jax.design.expected_error import ExpectedError
-from thincam_jax.design.objectives import Tolerances
 from thincam_jax.design.recommendation import MaskJudge
 from thincam_jax.units import nm, um
 
@@ -123,11 +121,7 @@ def run(name: str) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(record, indent=1))
 
-    problem = _Problem.of(setup, space, Tolerances())
-    others = [depth for depth in case.depths if depth != far]
-    middle = {"cells": problem.optics.cells, "focus": far}
-    moved = tuple(CellOptics(space, depth, float(pitch), **middle) for depth in others)
-    problem = replace(problem, moved=moved)  # the mean of the ends
+    problem = _Problem(space, CellJudge.of(setup, space, case.depths, nodes=4))
     record["limit"] = least_of_shadows(case)
     for rival, amplitudes in masks.items():
         if rival not in record["rivals"]:

@@ -67,7 +67,7 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
-    named = "study, refocus, screen, design, capture, denoiser, design_both, "
+    named = "study, refocus, screen, design, cells, capture, denoiser, "
     assert line.startswith(f"init camera: choose one of {named}")
     path = tmp_path / "no" / "study.yaml"
     line = one_line(call("init", "study", "--out", path))
@@ -84,7 +84,8 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     (tmp_path / place / "camera.yaml").write_text("", "utf-8")
     module = Path(kinds.__file__).relative_to(ROOT)
     monkeypatch.setattr(kinds, "__file__", str(tmp_path / module))
-    assert kinds.examples() == ["study", "refocus", "screen", "design", "capture", "camera"]
+    named = ["study", "refocus", "screen", "design", "cells", "capture", "camera"]
+    assert kinds.examples() == named
 
 
 def test_a_design_for_an_own_sensor(tmp_path):

@@ -21,7 +21,7 @@ def test_its_parts_are_there(name):
     declared = section.model_fields.get("kind")
     assert (declared is None) == (name == "study")
     assert declared is None or declared.annotation.__args__ == (name,)
-    assert (kind.command in ("run", "train")) == bool(kind.build and kind.run)
+    assert (kind.command != "capture") == bool(kind.build and kind.run)
     assert all(callable(kind.part(place)) for place in (kind.build, kind.run) if place)
     assert not kind.example or read_kind(ROOT / f"configs/{kind.example}.yaml") is kind
 
@@ -30,7 +30,7 @@ def test_an_unknown_kind_is_told(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("name: a\nkind: masks\n")
     told = (
-        "'masks' is unknown; write refocus, screen, design, capture, denoiser or trained, or leave"
+        "'masks' is unknown; write refocus, screen, design, cells, capture, denoiser or trained, or"
     )
     with pytest.raises(ConfigError, match=told):
         load_experiment(path)

@@ -133,7 +133,7 @@ class TestExplain:
         result = called("explain", path, *options_of(path, tmp_path))
         *values, work = result.stdout.splitlines()
         assert f"name: {load_experiment(path, command=None).name}" in values[0]
-        assert re.search("operations$|frames|batches$|entries|seeds$", work)
+        assert re.search("operations$|frames|batches$|entries|seeds$|evaluations$", work)
 
     def test_costs_of_its_cameras(self):
         lines = call("explain", ROOT / "configs/quick.yaml").stdout.splitlines()

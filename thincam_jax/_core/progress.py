@@ -15,6 +15,17 @@ _PATIENCE, _OFTEN, _SELDOM = 1.0, 0.5, 10.0
 _FIRST = "compiling, if this is the first of its size"
 
 _is_watched = contextvars.ContextVar("is_watched", default=False)
+_listener = contextvars.ContextVar[Callable[[str], None] | None]("listener", default=None)
+
+
+@contextlib.contextmanager
+def heard(listener: Callable[[str], None]) -> Iterator[None]:
+    """Call a function with each step or word of watched calls, which write no line then."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
 
 
 @contextlib.contextmanager
@@ -27,6 +38,9 @@ def watched(what: str) -> Iterator[Callable[..., None]]:
     end; elsewhere it is logged every ten seconds, as information. THINCAM_PROGRESS=off in the
     environment ends it.
     """
+    if (hear := _listener.get()) is not None:
+        yield lambda step, most, said="": hear(said or f"step {step} of at most {most}")
+        return
     if _is_watched.get() or os.environ.get("THINCAM_PROGRESS") == "off":
         yield lambda step, most, said="": None
         return

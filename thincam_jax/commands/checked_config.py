@@ -32,7 +32,8 @@ def load_as(
     places = Places(raw, lines, asked, f"{path}:1")
     config = check_as(model, places)
     folder = path.resolve().parent
-    named = {model.pictured: tuple(_placed(e, folder) for e in getattr(config, model.pictured))}
+    lists = filter(None, (model.pictured,))
+    named = {name: tuple(_placed(e, folder) for e in getattr(config, name)) for name in lists}
     named |= {name: _placed(getattr(config, name), folder) for name in model.with_path}
     config = config.model_copy(update=named)
     config._places = places

@@ -23,9 +23,9 @@ class Kind:
     - `section`: its configuration, as MODULE:NAME in the `commands` of its room or the package.
     - `costs`: function of a configuration and its objects that gives lines about its run.
     - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
-    - `build`, `run`: functions. For `thincam run`: makes objects of the configuration, and runs
-      these into a folder; its result has a `table`. For `thincam train`: makes the lessons, and
-      trains in a folder.
+    - `build`, `run`: functions. For `thincam run` and `design`: makes objects of the configuration,
+      and runs these into a folder; its result has a `table`, and `levels` of a design. For
+      `thincam train`: makes the lessons, and trains in a folder.
     - `room`: its room, one of `ROOMS`, if any.
     """
 
@@ -97,7 +97,11 @@ _ALL = {
     ),
     "design": Kind(
         *("a design", "design", "design.config:DesignConfig", "design.build:search"),
-        "design_distances",
+        *("design_distances", "design.build:build_design", "design.run:run_design"),
+    ),
+    "cells": Kind(
+        *("a search for cells", "design", "design.cells:FreeCellsConfig", "design.cells:work"),
+        *("design_cells", "design.cells:build_cells", "design.cells:run_cells"),
     ),
     "capture": Kind(
         *("a capture", "capture", "config:CaptureConfig", "command:frames"),

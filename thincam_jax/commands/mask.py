@@ -41,6 +41,7 @@ class ApertureConfig(section(FresnelZoneAperture, only=APERTURE)):
         return self
 
 
+Index = Annotated[float, Field(gt=1, le=4)]  # of refraction
 _WIDEST = 300.0  # mask of a thin camera, mm
 Relief = Literal["diffuser", "voronoi_fresnel", "contours"]
 Cells = Literal["mura", "ura", "mls", "random"]
@@ -137,7 +138,7 @@ class MaskConfig(
     sites: Annotated[int, Field(ge=1)] | None = None
     feature: Length | None = None
     line_width: Length | None = None
-    index: Annotated[float, Field(gt=1, le=4)] = 1.52
+    index: Index = 1.52
 
     @pydantic.model_validator(mode="after")
     def _family_fits(self):

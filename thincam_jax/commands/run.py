@@ -76,7 +76,9 @@ def run(
 
 
 def design(
-    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind 'design'.")],
+    config: Annotated[
+        Path, typer.Argument(help="Experiment file (YAML) of kind 'design' or 'cells'.")
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results. Default: runs/NAME.")
     ] = None,
@@ -85,23 +87,24 @@ def design(
 ) -> None:
     """Search for the best design.
 
-    Simulates it beside the design to beat; writes design.json, found.yaml, figures and report.html.
-    Ctrl-C keeps the targets that are finished; the same command goes on from there.
+    Simulates it beside the design to beat; or finds masks whose every cell is free. Writes
+    design.json, figures, report.html, and found.yaml or files of the masks. Ctrl-C keeps what is
+    finished; the same command goes on from there.
     """
-    goes_on = "interrupted; the same command goes on with the targets that are not finished."
+    goes_on = "interrupted; the same command goes on with what is not finished."
     with reported(lambda: goes_on):
-        from thincam_jax.commands.design.build import build_design
-        from thincam_jax.commands.design.run import DesignFolder, run_design
+        from thincam_jax.commands.design.run import DesignFolder
 
         wanted = load_experiment(config, tuple(set_ or ()), "design")
-        study = build_design(wanted)
+        kind = kind_of(wanted)
+        study = kind.part(kind.build)(wanted)
         warn(study.warnings)
         folder = DesignFolder.chosen(out, wanted.name, wanted)
         if dry_run:
             explain_run(wanted, folder.outcome(wanted))
             return
         with counted(wanted.name) as progress:
-            found = run_design(study, folder, progress)
+            found = kind.part(kind.run)(study, folder, progress)
     show(found.table())
     say(found.levels())
     say_result("report", folder.path / "report.html")

@@ -79,7 +79,7 @@ class RunFolder:
         """
         self.make(config)
         if (self.path / self.result).exists() or self.changed(config):
-            for finished in (self.path / "targets").glob("*.json"):
+            for finished in (self.path / "targets").glob("*"):
                 finished.unlink()
             (self.path / self.result).unlink(missing_ok=True)
         self.write(_ORIGIN, to_json(origin_of(config)))

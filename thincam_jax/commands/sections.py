@@ -211,7 +211,7 @@ class PictureConfig(TargetConfig):
 class ExperimentConfig(Section):
     """Keys that every kind of experiment file begins with."""
 
-    pictured: ClassVar[str] = "targets"  # the list that has image files
+    pictured: ClassVar[str] = "targets"  # the list that has image files, if any
     with_path: ClassVar[tuple[str, ...]] = ()  # further sections that name a file
     name: Name
     title: str = ""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from thincam_jax._core.progress import repeating
+from thincam_jax._core.progress import heard, repeating
 from thincam_jax._core.text import escaped
 
 if TYPE_CHECKING:
@@ -226,15 +226,21 @@ def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
 
 @contextlib.contextmanager
 def counted(name: str) -> Iterator[Callable[[str, int], None]]:
-    """A progress bar; what it yields is called at each step, with its text and their number."""
+    """A progress bar; what it yields is called at each step, with its text and their number.
+
+    Words of long calls stand behind the text of their step.
+    """
     with progress_bar() as bar, lines_in_a_log(bar):
-        task = bar.add_task(name, total=None)
+        task, now = bar.add_task(name, total=None), name
 
         def begun(text: str, total: int) -> None:
+            nonlocal now
+            now = text
             bar.update(task, advance=1, total=total, description=text)
             bar.start()
 
-        yield begun
+        with heard(lambda words: bar.update(task, description=f"{now}, {words}")):
+            yield begun
 
 
 @contextlib.contextmanager

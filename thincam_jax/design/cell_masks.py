@@ -28,7 +28,7 @@ from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, decimal_value, phasor, squared_modulus
-from thincam_jax._core.quantity import choice, quantity, whole
+from thincam_jax._core.quantity import FieldError, choice, quantity, whole
 from thincam_jax.lensless.masks.sampled import SampledMask
 
 Levels = Literal["binary", "grey", "binary_phase", "phase"]
@@ -47,7 +47,8 @@ _BIN = np.array([0.375, 0.25, 0.375])
 class CellMasks(Module):
     """Masks of captures whose every cell, or ring of cells, is free.
 
-    - `cell`: side of a cell, the least feature, mm; `count`: cells along a side of the mask.
+    - `cell`: side of a cell, the least feature, mm.
+    - `count`: cells along a side of the mask.
     - `distance`: d, mm; `wavelength`: mm.
     - `captures`: masks, which share the exposure evenly.
     - `levels`: "binary", open or closed; "grey", amplitudes of 0 to 1; "binary_phase", phases of
@@ -77,17 +78,18 @@ class CellMasks(Module):
     levels: Levels = eqx.field(
         default="binary", converter=choice(LEVELS), static=True, kw_only=True
     )
-    rings: bool = eqx.field(default=False, converter=bool, static=True, kw_only=True)
+    rings: bool = eqx.field(default=False, static=True, kw_only=True)
     fill_factor: Float[Array, ""] | None = eqx.field(
         default=None, converter=quantity(check=checks.fraction, optional=True), kw_only=True
     )
     contrast: Float[Array, ""] | None = eqx.field(
-        default=None, converter=quantity(least=1.0, optional=True), kw_only=True
+        default=None, converter=quantity(least=1.0, most=1e9, optional=True), kw_only=True
     )
 
     def __check_init__(self):
         if self.contrast is not None and "phase" in self.levels:
-            raise ValueError(f"levels {self.levels!r} are all open: leave the contrast out")
+            message = f"levels {self.levels!r} are all open: leave the contrast out"
+            raise FieldError(message, "contrast")
 
     @property
     def width(self) -> Float[Array, ""]:

@@ -12,7 +12,7 @@ import hashlib
 import io
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,6 +33,7 @@ from thincam_jax.design.cell_masks import (
     CellMasks,
     CellOptics,
     Numbers,
+    Transmittances,
     drawn_cells,
     without_lone_cells,
 )
@@ -47,7 +48,7 @@ _STEEPNESS, _SPREAD, _KEPT_EVERY = (2.0, 6.0, 18.0), 0.1, 10
 # Points of the field along an axis, and padding, which makes frequencies close: with less a mask
 # fits the points and frequencies that it is judged at.
 _NODES, _PADDING = 4, 1.25
-_FLIPPED = "binary", "binary_phase"
+FLIPPED = "binary", "binary_phase"
 
 
 @checked
@@ -55,11 +56,15 @@ _FLIPPED = "binary", "binary_phase"
 class CellSettings:
     """Settings of a search for cells.
 
-    - `draws`: random masks; `starts`: how many of the best of these it begins at, to go on from the
-      one that has the least error after a quarter of `steps`.
-    - `steps`: descents' steps at each of three steepnesses; `rate`: change of the numbers a step.
+    - `draws`: random masks.
+    - `starts`: how many of the best of these it begins at, to go on from the one that has the least
+      error after a quarter of the steps.
+    - `steps`: descents' steps at each of three steepnesses.
+    - `rate`: change of the numbers a step.
     - `flips`: most evaluations that then flip cells of binary levels, as long as that helps.
     - `lone_cells`: whether a cell may differ from all four beside it, which writers lose first.
+    - `depths`: distances of the scene, mm, whose mean error counts, of images made for the middle
+      one; by default the setup's alone. Each further one adds a PSF to every step.
     - `seed`: seed for all that is random.
     """
 
@@ -69,10 +74,18 @@ class CellSettings:
     rate: Annotated[float, quantity(positive=True)] = 0.1
     flips: Annotated[int, whole(0, 100_000)] = 100
     lone_cells: bool = True
+    depths: Annotated[tuple[float, ...], quantity("mm", positive=True, many=True)] = ()
     seed: Annotated[int, whole(0)] = 0
 
     def __post_init__(self):
         check_fields(self)
+
+    @property
+    def most(self) -> int:
+        """Evaluations of a search at most, a slope counted as three."""
+        steps = self.steps * len(_STEEPNESS) + (self.starts - 1) * _trial(self)
+        flips = (2 if self.lone_cells else 4) * (self.flips + 1)
+        return self.draws + 3 * (steps + flips)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +166,9 @@ def find_cells(
     **See also**: `limit`, `design.write_gds`.
     """
     settings, tolerances = settings or CellSettings(), tolerances or Tolerances()
-    if not settings.lone_cells and (space.rings or space.levels not in _FLIPPED):
+    if not settings.lone_cells and (space.rings or space.levels not in FLIPPED):
         raise ValueError("lone_cells=False is for binary levels of cells; leave it out for others")
-    problem = _Problem.of(setup, space, tolerances)
+    problem = _Problem(space, CellJudge.of(setup, space, settings.depths, tolerances, _NODES))
     shape = space.captures, space.free
     if start is not None and np.shape(start) != shape:
         raise ValueError(f"start has shape {np.shape(start)}; give (capture, free) = {shape}")
@@ -171,7 +184,7 @@ def find_cells(
             if file is not None and (step + 1) % _KEPT_EVERY == 0:
                 state.write(file, described)
         # From where the descent ends, and from the best random masks: either can be the better.
-        ends = [problem.flipped(one, settings) for one in (state.numbers, state.best)]
+        ends = [problem.flipped(one, settings, tell) for one in (state.numbers, state.best)]
         numbers, error, _ = min(ends, key=lambda end: end[1])
         flips = sum(taken for _, _, taken in ends)
     tried = 0 if start is not None else min(settings.starts, settings.draws) - 1
@@ -237,38 +250,60 @@ class _State:
         return _State(numbers, adam, history, best, random)
 
 
-class _Problem(eqx.Module):
-    space: CellMasks
+class CellJudge(eqx.Module):
+    """Expected error of cells' amplitudes, the mean over depths and tolerances.
+
+    - `optics`: those of the middle depth, which images are made for; `moved`: those of other depths
+      and of numbers that are off, each with its weight.
+    """
+
     optics: CellOptics
     error: ExpectedError
-    moved: tuple[CellOptics, ...]
+    moved: tuple[tuple[CellOptics, float], ...]
 
     @staticmethod
-    def of(setup: Setup, space: CellMasks, tolerances: Tolerances) -> "_Problem":
+    def of(
+        setup: Setup,
+        space: CellMasks,
+        depths: Sequence[float] = (),
+        tolerances: Tolerances | None = None,
+        nodes: int = 3,
+    ) -> "CellJudge":
+        """`depths`: mm; by default the setup's distance. `nodes`: see `ExpectedError`."""
         far, pitch, distance = (
             float(decimal_value(length))
             for length in (setup.object_distance, setup.pitch, space.distance)
         )
-        optics = CellOptics(space, far, pitch)
+        every = sorted(map(float, depths)) or [far]
+        focus = every[len(every) // 2]
+        optics = CellOptics(space, focus, pitch)
         grids, distances = [optics.grid] * space.captures, [distance] * space.captures
-        error = ExpectedError(setup, grids, distances, nodes=_NODES, padding=_PADDING)
-        moved = tuple(
-            CellOptics(one, away, pitch, cells=optics.cells, focus=far)
-            for one, away in _moved(space, far, tolerances)
+        error = ExpectedError(setup, grids, distances, nodes=nodes, padding=_PADDING)
+        moved = [(space, depth, 1 / len(every)) for depth in every if depth != focus]
+        moved += [(*one, 0.5) for one in _moved(space, focus, tolerances or Tolerances())]
+        others = tuple(
+            (CellOptics(one, away, pitch, cells=optics.cells, focus=focus), weight)
+            for one, away, weight in moved
         )
-        return _Problem(space, optics, error, moved)
+        return CellJudge(optics, error, others)
 
-    def logarithm(self, parts: Numbers) -> Float[Array, ""]:
-        """The error's logarithm at levels of cells."""
-        amplitudes = self.space.amplitudes(parts)
-
+    def __call__(self, amplitudes: Transmittances) -> Float[Array, ""]:
         def psfs(optics: CellOptics):
             return jax.lax.map(jax.checkpoint(lambda a: optics(a)), amplitudes)
 
         own = psfs(self.optics)
         exact = self.error(own)
-        moved = [self.error(psfs(optics), assumed=own) for optics in self.moved]
-        return jnp.log(exact + sum((one - exact) / 2 for one in moved))
+        moved = [(self.error(psfs(optics), assumed=own), weight) for optics, weight in self.moved]
+        return exact + sum(weight * (one - exact) for one, weight in moved)
+
+
+class _Problem(eqx.Module):
+    space: CellMasks
+    judge: CellJudge
+
+    def logarithm(self, parts: Numbers) -> Float[Array, ""]:
+        """The error's logarithm at levels of cells."""
+        return jnp.log(self.judge(self.space.amplitudes(parts)))
 
     def begun(
         self, settings: CellSettings, start: Numbers | None, tell: Callable[..., None]
@@ -278,9 +313,9 @@ class _Problem(eqx.Module):
         drawn = [drawn_cells(self.space, rng) for _ in range(settings.draws)]
         for cells in drawn:
             values.append(float(_logarithm(self, jnp.asarray(cells, float))))
-            tell(len(values), len(drawn), _said(min(values)))
+            tell(len(values), len(drawn), _said(np.fmin.reduce(values)))
         best = np.argsort(values, kind="stable")[: settings.starts]
-        random = math.exp(min(values))
+        random = math.exp(values[best[0]])
         starts = [drawn[n] - 0.5 for n in best] if start is None else [np.asarray(start, float)]
         for numbers in starts:
             begun = numbers + _SPREAD * rng.normal(size=numbers.shape)
@@ -303,7 +338,9 @@ class _Problem(eqx.Module):
         history = [*state.history, float(value)]
         return replace(state, numbers=numbers, adam=adam, history=history)
 
-    def flipped(self, numbers: Array, settings: CellSettings) -> tuple[Array, float, int]:
+    def flipped(
+        self, numbers: Array, settings: CellSettings, tell: Callable[..., None] = lambda *said: None
+    ) -> tuple[Array, float, int]:
         """Numbers as they are made, their error, and how many slopes were taken.
 
         The cells that promise most are flipped together; where that fails, half as many. Without
@@ -311,7 +348,7 @@ class _Problem(eqx.Module):
         """
         before = 0
         if not settings.lone_cells:
-            numbers, _, before = self.flipped(numbers, replace(settings, lone_cells=True))
+            numbers, _, before = self.flipped(numbers, replace(settings, lone_cells=True), tell)
 
         def made(parts: Array) -> Array:
             if settings.lone_cells:
@@ -321,7 +358,7 @@ class _Problem(eqx.Module):
 
         parts = made(self.space.parts(numbers))
         value, slope = _slope(self, parts)
-        if self.space.levels not in _FLIPPED:
+        if self.space.levels not in FLIPPED:
             return numbers, math.exp(float(value)), 1
         several = max(1, parts.size // 100)
         for taken in range(settings.flips):
@@ -333,6 +370,7 @@ class _Problem(eqx.Module):
             other = parts.ravel().at[chosen].set(1 - parts.ravel()[chosen])
             other = made(other.reshape(parts.shape))
             new, new_slope = _slope(self, other)
+            tell(taken, settings.flips, _said(min(float(new), float(value))))
             if new < value:
                 parts, value, slope = other, new, new_slope
             else:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
@@ -22,8 +21,9 @@ from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import decimal_value
 from thincam_jax._core.progress import watched
 from thincam_jax._core.table import Table
-from thincam_jax.design.cell_masks import CellMasks, CellOptics, drawn_cells
-from thincam_jax.design.expected_error import ExpectedError
+from thincam_jax.design.cell_masks import CellMasks, drawn_cells
+from thincam_jax.design.cell_search import CellJudge
+from thincam_jax.design.objectives import Tolerances
 from thincam_jax.design.setup import Setup
 from thincam_jax.lensless.masks.cells import ModifiedUniformlyRedundantArray
 from thincam_jax.lensless.masks.phase import relaxed_sites
@@ -35,7 +35,6 @@ Members = Iterator[tuple[str, Transmittances]]
 
 _PRIMES = (5, 11, 23, 43, 101, 251, 509)
 _DRAWN = 24  # random masks
-_NODES, _PADDING = 3, 1.25  # see `ExpectedError`
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +88,7 @@ def recommend(
     *,
     depths: Sequence[float] | None = None,
     kinds: Sequence[str] | None = None,
+    tolerances: Tolerances | None = None,
     seed: int = 0,
 ) -> Recommendations:
     """The best member of each kind of mask for a sensor, a scene and its light.
@@ -101,6 +101,7 @@ def recommend(
     - `depths`: distances of the scene, mm, in each of which the image for the middle one is judged;
       by default the setup's alone.
     - `kinds`: by default all of `KINDS`; those of phases let all light through.
+    - `tolerances`: standard deviations that the error is the mean over, see `find_cells`.
     - `seed`: seed for what is random.
 
     Some 120 members: two minutes for 512² cells before 1024² pixels. `find_cells` refines
@@ -130,7 +131,7 @@ def recommend(
     if unknown := [kind for kind in chosen if kind not in KINDS]:
         raise ValueError(f"kinds has {unknown[0]!r}; give some of {', '.join(KINDS)}")
     far = float(decimal_value(setup.object_distance))
-    judge = MaskJudge(setup, space, (far,) if depths is None else depths)
+    judge = MaskJudge(setup, space, depths or (), tolerances)
     found = []
     with watched("comparing masks") as tell:
         for number, kind in enumerate(chosen):
@@ -138,7 +139,8 @@ def recommend(
             for member, amplitudes in KINDS[kind](space, far, rng):
                 error, count = judge(amplitudes), count + 1
                 tell(number, len(chosen), f"{kind}, {member}: {10 * math.log10(error):.2f} dB")
-                if best is None or error < best[0]:
+                # A mask that is dark has none at an SNR.
+                if math.isfinite(error) and (best is None or error < best[0]):
                     best = error, member, amplitudes
             if best is not None:
                 error, member, amplitudes = best
@@ -151,44 +153,30 @@ class MaskJudge:
     """Expected errors of masks: a function of the amplitudes of each capture's cells.
 
     - `depths`: distances of the scene, mm; the image is made for the middle one. The error is the
-      mean over them.
+      mean over them and over `tolerances`.
     """
 
-    def __init__(self, setup: Setup, space: CellMasks, depths: Sequence[float]):
-        every = sorted(map(float, depths))
-        focus = every[len(every) // 2]
-        pitch, distance = (float(decimal_value(x)) for x in (setup.pitch, space.distance))
-        middle = CellOptics(space, focus, pitch)
-        self._optics = (
-            middle,
-            *(
-                CellOptics(space, depth, pitch, cells=middle.cells, focus=focus)
-                for depth in every
-                if depth != focus
-            ),
-        )
-
+    def __init__(
+        self,
+        setup: Setup,
+        space: CellMasks,
+        depths: Sequence[float],
+        tolerances: Tolerances | None = None,
+    ):
         @functools.cache
-        def error_of(captures: int) -> ExpectedError:
-            grids, distances = [middle.grid] * captures, [distance] * captures
-            return ExpectedError(setup, grids, distances, nodes=_NODES, padding=_PADDING)
+        def judge_of(captures: int) -> CellJudge:
+            several = space.replace(captures=captures)
+            return CellJudge.of(setup, several, depths, tolerances)
 
-        self._error_of = error_of
+        self._judge_of = judge_of
 
     def __call__(self, amplitudes: Transmittances) -> float:
-        error = self._error_of(len(amplitudes))
-        return float(_mean_error(self._optics, error, jnp.asarray(amplitudes)))
+        return float(_error(self._judge_of(len(amplitudes)), jnp.asarray(amplitudes)))
 
 
 @eqx.filter_jit
-def _mean_error(
-    optics: tuple[CellOptics, ...], error: ExpectedError, amplitudes: Array
-) -> Float[Array, ""]:
-    """Mean over the depths, of images made for the first."""
-    own = jax.lax.map(optics[0], amplitudes)
-    every = [error(own)]
-    every += [error(jax.lax.map(one, amplitudes), assumed=own) for one in optics[1:]]
-    return sum(every[1:], start=every[0]) / len(every)
+def _error(judge: CellJudge, amplitudes: Array) -> Float[Array, ""]:
+    return judge(amplitudes)
 
 
 # ---- The kinds. Each gives its members, of `space.count`² cells. -----------------------------

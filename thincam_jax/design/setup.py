@@ -16,7 +16,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import quantity
+from thincam_jax._core.quantity import FieldError, quantity
 
 
 @checked
@@ -159,9 +159,10 @@ class Setup(Module):
         lengths = self.pitch, self.sensor_width, self.object_distance, self.object_width
         pitch, sensor, distance, across = map(float, lengths)
         if not (1.5 < sensor / pitch < _MOST_PIXELS and across / distance < _WIDEST):
-            raise ValueError(
+            raise FieldError(
                 f"sensor_width = {sensor:g} mm are {sensor / pitch:.3g} pixels, object_width = "
-                f"{across:g} mm is {across / distance:.3g} times object_distance; give all in mm"
+                f"{across:g} mm is {across / distance:.3g} times object_distance; give all in mm",
+                "object_width",
             )
 
     @property

@@ -11,10 +11,11 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.design.training_search import TrainingError
-from thincam_jax.plot.frame import drawing, line_style
+from thincam_jax.plot.frame import drawing, line_style, show_image
 from thincam_jax.plot.objectives import draw_landscape
 
 if TYPE_CHECKING:
+    from thincam_jax.design.cell_search import CellDesign
     from thincam_jax.design.design import Shot
     from thincam_jax.design.landscape import Landscape
     from thincam_jax.design.ranking import ModulationTransfer, RankedDesign
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
+_FAINTEST_DB = -50.0  # of a PSF
 _FACE = {True: "white", False: "black"}  # of points that are dominated, and of the front's
 _MARKER: dict[str, Any] = {
     "markersize": 8,
@@ -61,6 +63,47 @@ def draw_masks(study: "Study", best: str) -> Figure:
                 drawn.set_title(f"{method.name}, {what}", fontsize=9)
             ax.set_ylabel(f"β {shot.beta:.4g} rad/mm² at {shot.distance:.3g} mm\ny (mm)")
     return figure
+
+
+def draw_cells(found: "CellDesign", psfs: np.ndarray, pitch: float) -> Figure:
+    """Masks of cells, the middle of those that are dark around it, and PSFs, a row a capture.
+
+    - `psfs`: (capture, y, x), of samples of a `pitch`, mm.
+    """
+    cell, phases = float(found.space.cell), "phase" in found.space.levels
+    masks = [np.asarray(mask.amplitude) for mask in found.masks]
+    half = max(_reach(np.abs(mask) ** 2, cell) for mask in masks)
+    middle = half < 0.35 * found.space.count * cell
+    columns = 3 if middle else 2
+    figure, rows = drawing((3.8 * columns, 3.2 * len(masks)), len(masks), columns, squeeze=False)
+    for number, (axes, mask, psf) in enumerate(zip(rows, masks, psfs, strict=True), 1):
+        name = f" {number}" if len(masks) > 1 else ""
+        shown = np.angle(mask) % (2 * np.pi) if phases else np.abs(mask)
+        most, label = (2 * np.pi, "phase (rad)") if phases else (1.0, "amplitude transmittance")
+        style: dict[str, Any] = {"vmin": 0, "vmax": most, "interpolation": "nearest"}
+        drawn = [show_image(ax, shown, cell, **style) for ax in axes[:-1]]
+        axes[0].set_title(f"mask{name}", fontsize=10)
+        if middle:
+            axes[1].set(xlim=(-half, half), ylim=(half, -half))
+            axes[1].set_title("its middle", fontsize=10)
+        elif found.space.levels != "binary":
+            figure.colorbar(drawn[0], ax=axes[0], label=label)
+        near = _reach(psf, pitch)
+        level = 10 * np.log10(np.maximum(psf / psf.max(), 1e-9))
+        light = show_image(axes[-1], level, pitch, vmin=_FAINTEST_DB, vmax=0)
+        axes[-1].set(xlim=(-near, near), ylim=(near, -near))
+        axes[-1].set_title(f"PSF{name}", fontsize=10)
+        figure.colorbar(light, ax=axes[-1], label="irradiance (dB of its maximum)")
+    return figure
+
+
+def _reach(light: np.ndarray, pitch: float) -> float:
+    """Half a side, mm, of a centred square that holds 95 % of the light, with a margin."""
+    places = np.abs(np.arange(len(light)) - (len(light) - 1) / 2)
+    ring = np.maximum(places[:, None], places).astype(int)
+    within = np.cumsum(np.bincount(ring.ravel(), np.ravel(light)))
+    number = int(np.searchsorted(within, 0.95 * within[-1]))
+    return min(2.0 * (number + 1), len(light) / 2) * pitch
 
 
 def draw_objective(

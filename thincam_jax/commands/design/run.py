@@ -10,7 +10,7 @@ from thincam_jax._core.text import slug
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.build import as_study_config
-from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.design.config import DesignConfig, DesignNoiseConfig
 from thincam_jax.commands.report import Content, Page, Part, Picture, Sentences, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, Step, as_record
 from thincam_jax.design.search import NonFiniteObjectiveError
@@ -50,19 +50,14 @@ def page(config: DesignConfig, design: DesignScores) -> Page:
     masks = f"{'of the reference ' if config.frees('width') else ''}{config.mask.width:g} mm"
     light = f"λ = {config.wavelength * 1e6:g} nm"
     light += " for the reference" if config.frees("wavelength") else ""
-    if config.noise.snr_db is not None:
-        noise = f"Gaussian noise at {config.noise.snr_db:g} dB of each capture's variance"
-    else:
-        noise = f"{config.noise.electrons:g} electrons a mm² of open aperture and "
-        noise += f"{config.noise.read_noise:g} of read noise"
     first, *others = design.findings()
     prior = number(design.objective.prior_exponent, 2)
     measured = ", as measured on the pictures" if config.prior.measured else ""
     lead = (
         f"{pixels_of(config.sensor)}, masks {masks} ({config.mask.profile}), object "
-        f"{config.object.width:g} mm wide at {config.object.distance:g} mm, {light}, {noise}, "
-        f"synthesis `{config.reference.synthesis}`. The scene's spectrum falls with the power "
-        f"{prior} of frequency{measured}. Seed {config.seed}.",
+        f"{config.object.width:g} mm wide at {config.object.distance:g} mm, {light}, "
+        f"{noise_of(config.noise)}, synthesis `{config.reference.synthesis}`. The scene's spectrum "
+        f"falls with the power {prior} of frequency{measured}. Seed {config.seed}.",
         Sentences(others),
         *config.notes,
     )
@@ -93,6 +88,14 @@ def page(config: DesignConfig, design: DesignScores) -> Page:
         Part("Pareto fronts", pareto),
     )
     return Page(lead, parts, "design", design.warnings, first)
+
+
+def noise_of(noise: DesignNoiseConfig) -> str:
+    """Noise of a design's file, in words."""
+    if noise.snr_db is not None:
+        return f"Gaussian noise at {noise.snr_db:g} dB of each capture's variance"
+    light = f"{noise.electrons:g} electrons a mm² of open aperture"
+    return f"{light} and {noise.read_noise:g} of read noise"
 
 
 def _images(config: DesignConfig, design: DesignScores) -> list[Picture]:
