@@ -30,6 +30,16 @@ def test_beats_the_best_random_masks(levels):
     assert "found" in str(found)
 
 
+def test_a_start_is_never_lost():
+    """A descent whose rate ruins it ends above where it began; the start is flipped as well."""
+    wild = CellSettings(draws=2, starts=1, steps=10, flips=0, rate=9.0)
+    start = jnp.asarray(find_cells(SETUP, space(), FEW).numbers)
+    judge = cell_search.CellJudge.of(SETUP, space(), nodes=4)
+    error = judge(space().amplitudes(space().parts(start)))
+    found = find_cells(SETUP, space(), wild, start=start)
+    assert found.error < float(error) * (1 + 1e-6)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     "changed", [{"levels": "grey"}, {"levels": "binary_phase"}, {"rings": True}]

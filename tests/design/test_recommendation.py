@@ -31,6 +31,14 @@ def test_every_kind_by_its_best_member(found):
     assert str(found).startswith("Judged by PSFs on the axis")
 
 
+def test_a_dark_mask_is_not_the_best_at_a_signal_to_noise_ratio():
+    """Noise at an SNR has no value for it: of 16 cells drawn at random most masks are dark."""
+    even = SETUP.replace(noise=tc.design.SignalNoise(30.0))
+    (best,) = recommend(even, SPACE.replace(count=4), kinds=("random cells",))
+    assert 0 < best.error < 1
+    assert best.amplitudes.any()
+
+
 def test_errors_are_those_of_exact_psfs(found):
     """By another propagation, on a sensor wider than the masks."""
     wide = tc.Sensor((96, 96), 0.02)

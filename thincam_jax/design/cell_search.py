@@ -3,7 +3,7 @@
 Each evaluation is exact diffraction of all cells and the error of the best linear image over the
 field (`ExpectedError`), with its slope at some four times the cost. A search begins at the best of
 random masks, descends by Adam while the levels harden, and flips cells of binary masks, both of
-those found and of the best random ones, as long as that helps: flips turn one opening into a lens,
+those found and of those it began at, as long as that helps: flips turn one opening into a lens,
 where a descent ends in a crowd of worse ones (docs/measured/full_size.md). It can be ended at any
 time and goes on from its folder.
 """
@@ -112,8 +112,8 @@ class CellDesign:
     def table(self) -> Table:
         """Both errors, dB."""
         rows = [
-            ("found", 10 * math.log10(self.error)),
-            (f"best random masks, evaluations: {self.evaluations}", 10 * math.log10(self.random)),
+            (f"found by {self.evaluations} evaluations", 10 * math.log10(self.error)),
+            ("best random masks of them", 10 * math.log10(self.random)),
         ]
         return Table(("masks", "expected error, dB"), rows, (2,))
 
@@ -183,8 +183,8 @@ def find_cells(
             tell(step, settings.steps * len(_STEEPNESS), _said(state.history[-1]))
             if file is not None and (step + 1) % _KEPT_EVERY == 0:
                 state.write(file, described)
-        # From where the descent ends, and from the best random masks: either can be the better.
-        ends = [problem.flipped(one, settings, tell) for one in (state.numbers, state.best)]
+        # From where the descent ends, and from its start: either can be the better.
+        ends = [problem.flipped(one, settings, tell) for one in (state.numbers, state.start)]
         numbers, error, _ = min(ends, key=lambda end: end[1])
         flips = sum(taken for _, _, taken in ends)
     tried = 0 if start is not None else min(settings.starts, settings.draws) - 1
@@ -211,20 +211,20 @@ def _described(problem: Any, settings: CellSettings, start: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A descent's numbers, Adam's, the history, and the best random masks."""
+    """A descent's numbers, Adam's, the history, where it began, and random masks' least error."""
 
     numbers: Array
     adam: Any
     history: list[float]
-    best: Array
+    start: Array
     random: float
 
     @staticmethod
-    def new(numbers: Array, best: Array, random: float) -> "_State":
-        return _State(numbers, adam_method().init(numbers), [], best, random)
+    def new(numbers: Array, start: Array, random: float) -> "_State":
+        return _State(numbers, adam_method().init(numbers), [], start, random)
 
     def write(self, file: Path, described: str) -> None:
-        leaves = map(np.asarray, jax.tree.leaves((self.numbers, self.best, self.adam)))
+        leaves = map(np.asarray, jax.tree.leaves((self.numbers, self.start, self.adam)))
         named = {f"leaf{n}": leaf for n, leaf in enumerate(leaves)}
         more = {"history": np.asarray(self.history), "random": self.random}
         content = io.BytesIO()
@@ -245,9 +245,9 @@ class _State:
             raise ValueError(f"{file}: holds no search; give another folder") from error
         if not same:
             raise ValueError(f"{file}: holds a search for other masks; give another folder")
-        numbers, best, *rest = leaves
+        numbers, start, *rest = leaves
         adam = jax.tree.unflatten(jax.tree.structure(adam_method().init(numbers)), rest)
-        return _State(numbers, adam, history, best, random)
+        return _State(numbers, adam, history, start, random)
 
 
 class CellJudge(eqx.Module):
@@ -319,9 +319,7 @@ class _Problem(eqx.Module):
         starts = [drawn[n] - 0.5 for n in best] if start is None else [np.asarray(start, float)]
         for numbers in starts:
             begun = numbers + _SPREAD * rng.normal(size=numbers.shape)
-            state = _State.new(
-                jnp.asarray(begun, float), jnp.asarray(drawn[best[0]] - 0.5, float), random
-            )
+            state = _State.new(jnp.asarray(begun, float), jnp.asarray(starts[0], float), random)
             for step in range(_trial(settings)):
                 state = self.stepped(state, step, settings)
             states.append(state)
