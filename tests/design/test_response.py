@@ -176,7 +176,7 @@ def test_light_of_a_small_object():
 def test_a_wide_sensor_counts_all_variance():
     """The window takes away what varies over more than the sensor: nothing if it is endless."""
     design, judged = small()
-    wide = dataclasses.replace(judged, sensor_width=jnp.asarray(1e4))
+    wide = dataclasses.replace(judged, sensor_width=jnp.asarray(2e3))
     frequencies = Quadrant(83.0, 64)
     whole = respond(design, judged, frequencies).whole
     everything = jnp.sum(
