@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from design import small
 
-from thincam_jax.design import BayesError, DesignSpace, sensitivity_around
+from thincam_jax.design import BayesError, DesignSpace, FrequencyCounts, sensitivity_around
 from thincam_jax.design.search import Found
 from thincam_jax.design.sensitivity import least_change, uncoupled
 from thincam_jax.design.setup import Quadrant
@@ -63,8 +63,9 @@ def test_of_a_plain_function():
 
 
 @pytest.mark.thorough
-def test_of_an_actual_objective():
-    """A change by the tolerance costs 1 %, on one side or the other, but for third order."""
+def test_of_an_actual_objective(monkeypatch):
+    """A change by the tolerance costs 1 %, on one side or the other, but for ripples of 0.02 dB."""
+    monkeypatch.setattr(small, "COUNTS", FrequencyCounts(radii=64, directions=1))
     problem = small.problem()
     one = found_at(problem, 20.0, 15.0)
     value = sensitivity_around(problem, one).values[0]
@@ -73,7 +74,7 @@ def test_of_an_actual_objective():
         float(problem.objective(found_at(problem, 20.0 + off, 15.0).design, problem.exact))
         for off in (-value.tolerance, 0.0, value.tolerance)
     ]
-    assert max(costs) / costs[1] == pytest.approx(1.01, abs=2e-3)
+    assert max(costs) / costs[1] == pytest.approx(1.01, abs=4e-3)
 
 
 @dataclasses.dataclass(frozen=True)

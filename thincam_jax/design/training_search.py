@@ -24,7 +24,6 @@ from thincam_jax.design.landscape import Landscape, drawn_variables, landscape_i
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.search import (
-    SEPARATION,
     Found,
     NonFiniteObjectiveError,
     Search,
@@ -34,7 +33,7 @@ from thincam_jax.design.search import (
     even_samples,
     without_repeats,
 )
-from thincam_jax.design.sensitivity import Derivatives, per_unit, uncoupled
+from thincam_jax.design.sensitivity import Derivatives, derivatives
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
 from thincam_jax.design.training import TrainedSensor, Training
@@ -172,7 +171,10 @@ class TrainingDescents:
         return TrainedDesigns(
             objective,
             found,
-            tuple(differences(problem, one) for one in found),
+            tuple(
+                derivatives(problem.objective, problem.space, problem.data, one.point)
+                for one in found
+            ),
             float(eqx.filter_jit(objective)(space.base, training)),
             self.evaluations + sum(ended.evaluations for ended in self.ended),
             sum(ended.failed for ended in self.ended),
@@ -214,22 +216,6 @@ def base_point(space: DesignSpace) -> np.ndarray | None:
     # On a bound, rounding may put it outside.
     inside = np.all((point >= -1e-5) & (point <= 1 + 1e-5))
     return np.clip(point, 0.0, 1.0) if inside else None
-
-
-def differences(problem: DesignProblem, found: Found) -> Derivatives:
-    """Derivatives by differences as wide as optima are apart: the error has finer ripples.
-
-    They are of some 0.01 dB. At a bound, those of the nearest point that has room on either side.
-    """
-    size = problem.space.size
-    space, place, spans = uncoupled(problem.space, found.point)
-    middle = np.clip(np.asarray(place, float), SEPARATION, 1 - SEPARATION)
-    steps = SEPARATION * np.eye(size)
-    points = np.concatenate([middle[None], middle + steps, middle - steps])
-    points = jnp.asarray(points, space.lower.dtype)
-    values = evaluate(problem.objective, space, problem.data, points, at_a_time=1)
-    level, up, down = np.split(np.asarray(values, float), [1, 1 + size])
-    return per_unit((up - down) / (2 * SEPARATION), (up - 2 * level + down) / SEPARATION**2, spans)
 
 
 def build_training(
