@@ -82,7 +82,9 @@ def lit(texture=0.0):
     return room * (1 + texture * np.random.default_rng(6).normal(size=room.shape))
 
 
-def test_behind_a_lens_the_noise_is_found_from_the_captures_detail():
+@pytest.mark.parametrize("black", [0.0, 0.5])
+def test_behind_a_lens_the_noise_is_found_from_the_captures_detail(black):
+    """Above a black level that was left in, too."""
     A = focused()
     clean = np.asarray(A(jnp.asarray(lit(), float)))
     variance = clean * clean.mean() / 2000
@@ -90,7 +92,8 @@ def test_behind_a_lens_the_noise_is_found_from_the_captures_detail():
     seen = tc.Recording(capture, A, noise_variance=float(variance.mean()))
     noise = noise_of(seen, 1e-3)
     assert not noise.tells and not noise.grows
-    (found,) = np.asarray(detail_variances(seen.problem())[0])
+    raised = tc.Recording(capture + black * capture.mean(), A)
+    (found,) = np.asarray(detail_variances(raised.problem())[0])
     expected = np.maximum(clean / clean.mean(), 0.1)
     assert abs(np.mean(found / expected) - 1) < 0.1
     assert np.std(found / expected) < 0.2

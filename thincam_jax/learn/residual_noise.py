@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
-import scipy.optimize
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax.imaging.operators import AbstractOperator
@@ -113,9 +112,9 @@ def _detail_variance(
     square = np.maximum(square, 1e-3 * square.max())  # of black that is cut
     if not square.max() > 0:
         return None
-    # Relative to each class's own, neither a nor b negative.
+    # Relative to each class's own; a is negative above a black level that was left in.
     sides = np.stack([np.ones_like(level), level], axis=-1) / square[:, None]
-    (base, slope), _ = scipy.optimize.nnls(sides, np.ones_like(level))
+    (base, slope), *_ = np.linalg.lstsq(sides, np.ones_like(level))
     fitted = base + slope * level
     if not 0 < _DETAIL_CONTRAST * fitted[0] < fitted[-1]:
         return None
