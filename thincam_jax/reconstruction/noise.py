@@ -178,9 +178,11 @@ def details_by_light(
     plane: Float[np.ndarray, "y x"], valid: Bool[np.ndarray, "y x"]
 ) -> tuple[Float[np.ndarray, " detail"], Float[np.ndarray, " detail"]]:
     """Mean light of 3×3 pixels, all valid, and their detail's size, the darkest first."""
-    detail = np.diff(np.diff(plane, 2, 0), 2, 1)
-    light = sliding_window_view(plane, (3, 3)).mean(axis=(-2, -1))
-    known = np.asarray(sliding_window_view(valid, (3, 3)).all(axis=(-2, -1)))
+    detail, light, known = plane, plane, valid
+    for axis in (0, 1):  # one after the other takes half the time of both at once
+        detail = np.diff(detail, 2, axis)
+        light = sliding_window_view(light, 3, axis).mean(axis=-1)
+        known = np.asarray(sliding_window_view(known, 3, axis).all(axis=-1))
     light, detail = light[known], np.abs(detail[known])
     order = np.argsort(light)
     return light[order], detail[order]
